@@ -119,7 +119,7 @@ auto lookalikes(const Packed& packed_features, const Reals& heights, const Packe
     }
     if (int64_t(pairs.size()) > room) pairs.resize(size_t(room));
   });
-  return as_numpy<int32_t>(std::move(pairs));
+  return pairs;
 }
 
 // Counts (columns, rows), columns along x, the features that vote for a camera in a square of two cells' side that begins at the cell's
@@ -223,8 +223,7 @@ auto block_log_odds(const Evidence& one, const Evidence& other, const Array<doub
                     const std::tuple<double, double, double, double, double>& model, double block_m, int room) {
   if (room < 0 || room > 1 << 20) throw nb::value_error("room: up to 2^20");
   check_place(one), check_place(other);
-  return as_numpy<double>(
-      unlocked([&] { return odds_of_blocks(one, other, lattices, std::make_from_tuple<CellModel>(model), block_m, size_t(room)); }));
+  return unlocked([&] { return odds_of_blocks(one, other, lattices, std::make_from_tuple<CellModel>(model), block_m, size_t(room)); });
 }
 
 }  // namespace

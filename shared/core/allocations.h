@@ -5,20 +5,17 @@
 
 namespace fleetmap {
 
-// All allocations of this thread by operator new.
-uint64_t all_allocations();
-
-// Allocations of this thread within counted steps.
-uint64_t step_allocations();
+// Of this thread, by operator new: all, and those within counted steps.
+inline thread_local uint64_t all_allocations = 0, step_allocations = 0;
 
 class CountedStep {
  public:
-  CountedStep() : before_(all_allocations()) {}
+  CountedStep() = default;
   CountedStep(const CountedStep&) = delete;
-  ~CountedStep();
+  ~CountedStep() { step_allocations += all_allocations - before_; }
 
  private:
-  uint64_t before_;
+  uint64_t before_ = all_allocations;
 };
 
 }  // namespace fleetmap

@@ -15,10 +15,10 @@ struct Lists {
 };
 
 // For each position in the order of elimination the coupled ones before it, or after it.
-Lists neighbours(const std::vector<std::pair<int64_t, int64_t>>& pairs, const NodeList& position, bool after) {
+Lists neighbours(const NodePairs& pairs, const NodeList& position, bool after) {
   Lists lists{std::vector<int64_t>(position.size() + 1), NodeList(pairs.size())};
-  auto ends = [&](const std::pair<int64_t, int64_t>& pair) {
-    const auto [early, late] = std::minmax({position[size_t(pair.first)], position[size_t(pair.second)]});
+  auto ends = [&](const std::array<int64_t, 2>& pair) {
+    const auto [early, late] = std::minmax({position[size_t(pair[0])], position[size_t(pair[1])]});
     return after ? std::pair(early, late) : std::pair(late, early);
   };
   for (const auto& pair : pairs) ++lists.starts[size_t(ends(pair).first) + 1];
@@ -146,8 +146,7 @@ constexpr double kPlus = 1.0, kMinus = -1.0, kNone = 0.0;
 
 }  // namespace
 
-BlockCholesky::BlockCholesky(const std::vector<int64_t>& sizes, const std::vector<std::pair<int64_t, int64_t>>& pairs,
-                             std::vector<int64_t> order)
+BlockCholesky::BlockCholesky(const std::vector<int64_t>& sizes, const NodePairs& pairs, std::vector<int64_t> order)
     : position_(positions_of(order)) {
   const size_t count = sizes.size();
   const std::vector<int64_t> given = order;

@@ -6,9 +6,9 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
-#include <utility>
 #include <vector>
 
 namespace fleetmap {
@@ -18,11 +18,13 @@ struct BlockPlace {
   int64_t first, down, right;
 };
 
+using NodePairs = std::vector<std::array<int64_t, 2>>;
+
 class BlockCholesky {
  public:
   // The pattern of nodes with sizes[n] unknowns each, numbered consecutively, coupled in pairs. order: elimination order of the nodes with
   // little fill-in; every subtree of their elimination tree is then made contiguous.
-  BlockCholesky(const std::vector<int64_t>& sizes, const std::vector<std::pair<int64_t, int64_t>>& pairs, std::vector<int64_t> order);
+  BlockCholesky(const std::vector<int64_t>& sizes, const NodePairs& pairs, std::vector<int64_t> order);
 
   // Number of values of a factor.
   size_t size() const { return size_; }

@@ -33,30 +33,7 @@ double squared(const double* values, size_t count) {
 
 Mat3 full(const std::array<double, 6>& s) { return {{{s[0], s[1], s[2]}, {s[1], s[3], s[4]}, {s[2], s[4], s[5]}}}; }
 
-// block (6, 6) += sign L(a) M L(b)^T, L(q) = [skew(q); I].
-inline void add_lifted(double sign, Vec3 a, const Mat3& m, Vec3 b, double* __restrict block) {
-  double right[3][kPose];  // M L(b)^T
-  for (int row = 0; row < 3; ++row) {
-    store(cross(b, vec3(m[row])), right[row]);
-    store(vec3(m[row]), right[row] + 3);
-  }
-  for (int c = 0; c < kPose; ++c) {
-    block[c] += sign * (a[1] * right[2][c] - a[2] * right[1][c]);
-    block[6 + c] += sign * (a[2] * right[0][c] - a[0] * right[2][c]);
-    block[12 + c] += sign * (a[0] * right[1][c] - a[1] * right[0][c]);
-    block[18 + c] += sign * right[0][c];
-    block[24 + c] += sign * right[1][c];
-    block[30 + c] += sign * right[2][c];
-  }
-}
-
-// rhs (6,) += L(q) f.
-inline void add_lifted(Vec3 q, Vec3 f, double* rhs) {
-  const Vec3 turn = cross(q, f);
-  for (int a = 0; a < 3; ++a) rhs[a] += turn[a], rhs[3 + a] += f[a];
-}
-
-// to (6, n) += sign L(q) M for M (3, n).
+// to (6, n) += sign L(q) M for M (3, n), L(q) = [skew(q); I].
 inline void add_lifted(double sign, Vec3 q, const double* __restrict m, size_t n, double* __restrict to) {
   const double *m0 = m, *m1 = m + n, *m2 = m + 2 * n;
   for (size_t c = 0; c < n; ++c) {
@@ -68,6 +45,19 @@ inline void add_lifted(double sign, Vec3 q, const double* __restrict m, size_t n
     to[5 * n + c] += sign * m2[c];
   }
 }
+
+// block (6, 6) += sign L(a) M L(b)^T.
+inline void add_lifted(double sign, Vec3 a, const Mat3& m, Vec3 b, double* __restrict block) {
+  double right[3][kPose];  // M L(b)^T
+  for (int row = 0; row < 3; ++row) {
+    store(cross(b, vec3(m[row])), right[row]);
+    store(vec3(m[row]), right[row] + 3);
+  }
+  add_lifted(sign, a, right[0], kPose, block);
+}
+
+// rhs (6,) += L(q) f.
+inline void add_lifted(Vec3 q, Vec3 f, double* rhs) { add_lifted(1.0, q, f.at, 1, rhs); }
 
 // H_ll of a point, damped.
 Mat3 damped(const std::array<double, 6>& info, double damping) {
@@ -489,14 +479,14 @@ void BundleSolver::for_each_edge_part(const Add& add) const {
   }
 }
 
-std::vector<std::pair<int64_t, int64_t>> BundleSolver::node_pairs() const {
+NodePairs BundleSolver::node_pairs() const {
   const int64_t parts = problem_.unknowns > kPose ? 2 : 1;
-  std::vector<std::pair<int64_t, int64_t>> pairs;
+  NodePairs pairs;
   for (size_t p = 0; p < slots(); ++p)
-    for (size_t s = row_starts_[p]; s < row_starts_[p + 1]; ++s) pairs.emplace_back(parts * int64_t(p), parts * cols_[s]);
-  for_each_edge_part([&](size_t, int x, int y, int32_t p, int32_t q) { pairs.emplace_back(2 * p + x % 2, 2 * q + y % 2); });
+    for (size_t s = row_starts_[p]; s < row_starts_[p + 1]; ++s) pairs.push_back({parts * int64_t(p), parts * cols_[s]});
+  for_each_edge_part([&](size_t, int x, int y, int32_t p, int32_t q) { pairs.push_back({2 * p + x % 2, 2 * q + y % 2}); });
   const int64_t last = parts * int64_t(slots());
-  for (int64_t p = 0; columns() && p <= last; p += parts) pairs.emplace_back(last, p);
+  for (int64_t p = 0; columns() && p <= last; p += parts) pairs.push_back({last, p});
   return pairs;
 }
 

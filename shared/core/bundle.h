@@ -108,7 +108,7 @@ class BundleSolver {
 
   // The reduced system's nodes, the pose of each slot and its motion where there is one, then the calibration, and which are coupled.
   std::vector<int64_t> node_sizes() const;
-  std::vector<std::pair<int64_t, int64_t>> node_pairs() const;
+  NodePairs node_pairs() const;
   // Systems are factorised as sparse ones from now on; order: elimination order of the nodes with little fill-in.
   // Returns the number of values of a factor.
   size_t factorise_sparsely(std::vector<int64_t> order);

@@ -83,7 +83,7 @@ auto undistort(const Array<double, 8>& coefficients, const Reals& goals_x, const
       found_x[n] = x, found_y[n] = y;
     }
   });
-  return std::tuple(as_numpy<double>(std::move(found_x)), as_numpy<double>(std::move(found_y)));
+  return std::tuple(std::move(found_x), std::move(found_y));
 }
 
 // Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 at which the image of

@@ -258,7 +258,7 @@ auto spread_corners(const Image& image, int count, double distance_px, int thres
   const CornerLimits limits{threshold, border_px, distance_px, clearance(clearance_px), scale, clear_px};
   CornerFinder found;
   unlocked([&] { found.find(image, size_t(count), limits, first(taken), taken.shape(0)); });
-  return std::tuple(as_numpy<float>(std::move(found.corners)), as_numpy<double>(std::move(found.scores)));
+  return std::tuple(as_numpy<float>(std::move(found.corners)), std::move(found.scores));
 }
 
 // The direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
@@ -302,7 +302,7 @@ auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
       degrees[n] = float(angle < 0.0 ? angle + 360.0 : angle);
     }
   });
-  return as_numpy<float>(std::move(degrees));
+  return degrees;
 }
 
 }  // namespace

@@ -3,12 +3,14 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <stdexcept>
 
 namespace fleetmap {
 
 namespace {
 
 constexpr size_t kNav = Filter::kNav, kClones = Filter::kClones;
+constexpr size_t kMostClones = 1000;
 constexpr double kPositionGate = 11.345;  // 0.99 of chi-square with 3 degrees of freedom
 
 struct NavMatrix {
@@ -179,7 +181,7 @@ Vec3 Filter::propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, 
 }
 
 void Filter::predict_random_walk(const SE3& body_from_next, double rotation_sigma, double translation_sigma, double duration_s,
-                                 const double* measured) {
+                                 const std::optional<Mat6>& measured) {
   const SE3 next = state.body() * body_from_next;
   state.rotation = next.rotation, state.position = next.translation;
   Matrix &shape = gain_, &shape_turned = gain_turned_, &spread = spread_, &process = seen_, &part = part_;
@@ -192,7 +194,7 @@ void Filter::predict_random_walk(const SE3& body_from_next, double rotation_sigm
     // (free^-1 + measured^-1)^-1: the measured one if it is narrow, the free one if that is wider
     Matrix &sum = taken_, &solved = turned_;
     sum = spread, solved = spread;
-    for (int k = 0; k < 36; ++k) sum.values[k] += measured[k];
+    for (int k = 0; k < 36; ++k) sum.values[k] += measured->at[k];
     solve_in_place(sum, solved);
     multiply(spread, solved, part);
     if (fleetmap::is_finite(part[0], 36))
@@ -220,7 +222,14 @@ void Filter::forget_pair(double duration_s) {
   }
 }
 
+size_t Filter::index_of(int64_t id) const {
+  const auto found = std::find(clone_ids_.begin(), clone_ids_.end(), id);
+  if (found == clone_ids_.end()) throw std::invalid_argument("clone_id: of a clone that is held");
+  return size_t(found - clone_ids_.begin());
+}
+
 void Filter::add_clone(int64_t id, Vec3 rate_body) {
+  if (clones_.size() == kMostClones) throw std::invalid_argument("clone_id: at most 1000 clones are held");
   const Vec3 turn = state.rotation * rate_body, shift = state.velocity + cross(state.position, turn);
   const double by_offset[6] = {turn[0], turn[1], turn[2], shift[0], shift[1], shift[2]};
   for (auto [p, first] : both()) augment(*p, first, by_offset, spare_);
@@ -228,13 +237,15 @@ void Filter::add_clone(int64_t id, Vec3 rate_body) {
   clones_.push_back(state.body());
 }
 
-void Filter::remove_clone(size_t index) {
+void Filter::remove_clone(int64_t id) {
+  const size_t index = index_of(id);
   for (auto [p, first] : both()) marginalise(*p, clone_errors(first, index).rotation, spare_);
   clone_ids_.erase(clone_ids_.begin() + ptrdiff_t(index));
   clones_.erase(clones_.begin() + ptrdiff_t(index));
 }
 
-void Filter::return_to_clone(size_t index) {
+void Filter::return_to_clone(int64_t id) {
+  const size_t index = index_of(id);
   state.rotation = clones_[index].rotation, state.position = clones_[index].translation;
   for (auto [p, first] : both()) {
     const auto body = numbers(state_errors(first)), from = numbers(clone_errors(first, index));
@@ -244,7 +255,8 @@ void Filter::return_to_clone(size_t index) {
   }
 }
 
-Vec3 Filter::begin_frame_anew() {
+SE3 Filter::begin_frame_anew() {
+  if (clones_.empty()) throw std::invalid_argument("a clone is needed");
   const Vec3 begin = clones_.back().translation;
   move_origin(begin);
   for (auto [p, first] : both()) {
@@ -264,7 +276,7 @@ Vec3 Filter::begin_frame_anew() {
     }
     symmetrise(c);
   }
-  return begin;
+  return {kIdentity, -begin};
 }
 
 // Counts positions, and errors of them, from another point of the frame: p - by changes by Exp(turn) by - by besides.
@@ -557,10 +569,10 @@ void Filter::correct_by_speed(Vec3 velocity, double sigma_mps) {
   correct_with(m, std::numeric_limits<double>::infinity());
 }
 
-bool Filter::inflate(size_t index, Vec3 seen_position, double gap_s) {
+bool Filter::inflate(int64_t id, const SE3& seen_odom_from_body, double gap_s) {
   // The position since the clone, as far as both turn about the origin together.
   const Mat3 lever = skew(state.position);
-  const auto body = numbers(state_errors(0)), clone = numbers(clone_errors(0, index));
+  const auto body = numbers(state_errors(0)), clone = numbers(clone_errors(0, index_of(id)));
   Matrix pick(3, covariance.rows), pick_turned, part, spread;
   for (int a = 0; a < 3; ++a)
     for (int b = 0; b < 3; ++b) {
@@ -571,7 +583,7 @@ bool Filter::inflate(size_t index, Vec3 seen_position, double gap_s) {
   transpose(pick, pick_turned);
   multiply(part, pick_turned, spread);
   for (int a = 0; a < 3; ++a) spread[a][a] += 1e-4;
-  const Vec3 off = seen_position - state.position;
+  const Vec3 off = seen_odom_from_body.translation - state.position;
   Vec3 solved = off;
   if (solve_spd(spread[0], solved.at, 3, 3) && dot(off, solved) < kPositionGate) return false;
   const double size = norm(off), speed = size / std::max(gap_s, 0.1);
@@ -587,26 +599,36 @@ void Filter::inflate_velocity(double sigma_mps) {
     for (size_t a = 0; a < 3; ++a) (*p)[first + kVelocity + a][first + kVelocity + a] += sigma_mps * sigma_mps;
 }
 
-void Filter::motion_covariance(size_t index, double* out) const {
+std::tuple<SE3, Mat6> Filter::motion_since(int64_t id) const {
   const Matrix& c = true_error_cov;
+  const size_t index = index_of(id);
   const size_t at = clone_errors(kConsidered, index).rotation, end = clone_errors(kConsidered, clones_.size() - 1).rotation;
   double difference[6][6], adjoint[36] = {};
   for (size_t a = 0; a < 6; ++a)
     for (size_t b = 0; b < 6; ++b) difference[a][b] = c[end + a][end + b] + c[at + a][at + b] - c[end + a][at + b] - c[at + a][end + b];
   const SE3 earlier_from_odom = inverse(clones_[index]);
+  Mat6 covariance;
   store(earlier_from_odom.rotation, adjoint, 6);
   store(earlier_from_odom.rotation, adjoint + 21, 6);
   store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, adjoint + 18, 6);
-  carry<6, 6>(adjoint, difference[0], out);
+  carry<6, 6>(adjoint, difference[0], covariance.at);
+  return {earlier_from_odom * clones_.back(), covariance};
 }
 
-void Filter::body_covariance(double* out) const {
+SE3 Filter::cam_from_earlier(int64_t id, const SE3& cam_from_body, size_t camera) const {
+  if (camera >= model_.cameras.size()) throw std::invalid_argument("camera: its number");
+  return cam_from_body * (inverse(state.body()) * clone(id)) * model_.cameras[camera].body_from_cam;
+}
+
+Mat6 Filter::body_covariance() const {
   double own[9][9], jacobian[6][9] = {};
   for (size_t a = 0; a < 9; ++a) std::copy_n(true_error_cov[kConsidered + a] + kConsidered, 9, own[a]);
   store(kIdentity, jacobian[0], 9);
   store(kIdentity, jacobian[3] + kPosition, 9);
   store(-1.0 * skew(state.position), jacobian[3], 9);
-  carry<6, 9>(jacobian[0], own[0], out);
+  Mat6 covariance;
+  carry<6, 9>(jacobian[0], own[0], covariance.at);
+  return covariance;
 }
 
 }  // namespace fleetmap

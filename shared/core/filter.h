@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -41,6 +42,8 @@ struct FilterModel {
 // model: points that slip along their way, disparities that stay wrong, a pair that is slightly off. Only this one is reported. Its
 // first four errors are considered, never estimated: the pair's disparity offset and depth scale, the scales of the wheels' speed and
 // yaw rate. Source: covariance analysis of suboptimal filters, Maybeck 1979, chapter 6.
+//
+// A clone is named by its id; std::invalid_argument for one that is not held.
 class Filter {
  public:
   // Numbers of the errors: the state's, the clock's, then six for each clone, rotation and position.
@@ -54,22 +57,21 @@ class Filter {
   // Moves the state from start to end; the last angular rate, bias removed. noise weighs the prediction, true_noise is real.
   Vec3 propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, const ImuNoise& noise, const ImuNoise& true_noise);
 
-  // Moves the state by a relative transform, uncertain by the sigmas. measured (6, 6), in the next body's axes, rotation first,
-  // is added information if given.
+  // Moves the state by a relative transform, uncertain by the sigmas. measured, in the next body's axes, is added information if given.
   void predict_random_walk(const SE3& body_from_next, double rotation_sigma, double translation_sigma, double duration_s,
-                           const double* measured);
+                           const std::optional<Mat6>& measured);
 
   // Keeps the current body in the window; its rate (rad/s) ties it to the time offset.
   void add_clone(int64_t id, Vec3 rate_body);
   // Forgets a clone: marginalises it.
-  void remove_clone(size_t index);
+  void remove_clone(int64_t id);
   // Resets rotation and position of the state to a clone's, with its covariance; the motion since is forgotten.
-  void return_to_clone(size_t index);
-  // Moves the frame's origin to the newest clone, from which errors count; returns its pose in the old frame. Motions between clones, and
+  void return_to_clone(int64_t id);
+  // Moves the frame's origin to the newest clone, from which errors count; new_from_old. Motions between clones, and
   // their covariances, stay. Only the absolute error of the old frame is forgotten, which no motion shows.
   // It grows without bound with the distance from the origin, until the motion between two clones is a difference of
   // numbers so large that rounding leaves no covariance. Velocity and biases must be unused.
-  Vec3 begin_frame_anew();
+  SE3 begin_frame_anew();
 
   // Adds one camera's observations in a frame: ids (count,), pixels (count, 3) u left, v, u right, NaN if that is unknown.
   void observe(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count) {
@@ -97,19 +99,21 @@ class Filter {
   // Inflates position and velocity if vision contradicts the prediction since a clone beyond its covariance; true if it did.
   // Values that are not finite contradict nothing.
   // After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every image never recovers.
-  bool inflate(size_t index, Vec3 seen_position, double gap_s);
+  bool inflate(int64_t id, const SE3& seen_odom_from_body, double gap_s);
   void inflate_velocity(double sigma_mps);
 
   // earlier_from_later between two clones.
-  SE3 motion_between(size_t earlier, size_t later) const { return inverse(clones_[earlier]) * clones_[later]; }
-  // Covariance (6, 6) of the motion from a clone to the newest one, of a left perturbation in axes of the earlier body: from the joint
+  SE3 motion_between(int64_t earlier, int64_t later) const { return inverse(clone(earlier)) * clone(later); }
+  // The motion from a clone to the newest one, and its covariance, of a left perturbation in axes of the earlier body: from the joint
   // covariance of both, so that common errors cancel.
-  void motion_covariance(size_t index, double* out) const;
-  // Covariance (6, 6) of odom_from_body: rotation error in odom axes, then position error.
-  void body_covariance(double* out) const;
+  std::tuple<SE3, Mat6> motion_since(int64_t id) const;
+  // From a camera of a clone to one on the state's body.
+  SE3 cam_from_earlier(int64_t id, const SE3& cam_from_body, size_t camera) const;
+  // Of odom_from_body: rotation error in odom axes, then position error.
+  Mat6 body_covariance() const;
 
   const std::vector<int64_t>& clone_ids() const { return clone_ids_; }
-  const SE3& clone(size_t index) const { return clones_[index]; }
+  const SE3& clone(int64_t id) const { return clones_[index_of(id)]; }
   const std::vector<RigCamera>& cameras() const { return model_.cameras; }
 
   NavState state;
@@ -117,6 +121,7 @@ class Filter {
   Matrix covariance, true_error_cov;
 
  private:
+  size_t index_of(int64_t id) const;
   bool is_finite() const;
   // A covariance, and the number of the state's first error in it.
   using Errors = std::pair<Matrix*, size_t>;

@@ -62,19 +62,20 @@ std::vector<int32_t> joined(const Numbers& first, const Numbers& second, const N
 
 auto join_tracks(const Numbers& first, const Numbers& second, const Numbers& keyframes) {
   check_rows(first.shape(0), "second: as many as first", second);
-  return as_numpy<int32_t>(unlocked([&] { return joined(first, second, keyframes); }));
+  return unlocked([&] { return joined(first, second, keyframes); });
 }
 
-// Marks keyframes that are spare, checked from the last to the second: a share of their tracks, and at least `least`, are seen equally
-// finely on enough other visits. Members of tracks more than `gap` keyframes apart are of different visits. rows: the members of each
-// keyframe; starts: those of each track, by rising keyframe.
-auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indices& tracks, const Indices& starts, const Indices& keyframes,
-                     const Array<int8_t, -1>& octaves, int64_t gap, int64_t visits, double share, int64_t least) {
+// Marks redundant keyframes, checked in `order`: a share of their tracks, and at least `least`, are seen equally finely on enough other
+// visits. Members of tracks more than `gap` keyframes apart are of different visits. rows: the members of each keyframe that count;
+// starts: those of each track, by rising keyframe where the gap is not 0. Source: Mur-Artal and Tardos 2015.
+auto redundant_keyframes(const Indices& order, const Indices& rows, const Indices& row_starts, const Indices& tracks, const Indices& starts,
+                         const Indices& keyframes, const Array<int8_t, -1>& octaves, int64_t gap, int64_t visits, double share,
+                         int64_t least) {
   const size_t members = tracks.shape(0);
   check_rows(members, "keyframes, octaves: one for each member", keyframes, octaves);
   const Lists by_keyframe(row_starts, rows.shape(0), "row_starts: rising, of rows");
   const Lists by_track(starts, members, "starts: rising, of members");
-  std::vector<uint8_t> spare(by_keyframe.count);
+  std::vector<uint8_t> gone(by_keyframe.count);
   const int64_t *const row_of = rows.data(), *const track_of = tracks.data(), *const keyframe_of = keyframes.data();
   const int8_t* const octave_of = octaves.data();
   // How many visits besides its own see the track of a member, whose scale is not finer than theirs.
@@ -82,23 +83,24 @@ auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indic
     int64_t found = 0, last = -1;
     for (const int64_t n : by_track[size_t(track_of[member])]) {
       const int64_t k = keyframe_of[n];
-      if (spare[size_t(k)] || std::abs(k - keyframe_of[member]) <= gap || octave_of[n] > octave_of[member] + 1) continue;
-      found += last < 0 || k - last > gap;
+      if (gone[size_t(k)] || std::abs(k - keyframe_of[member]) <= gap || octave_of[n] > octave_of[member] + 1) continue;
+      found += last < 0 || std::abs(k - last) > gap;
       last = k;
     }
     return found;
   };
   unlocked([&] {
+    check_below(by_keyframe.count, "order: of keyframes", order);
     check_below(members, "rows: of members", rows);
     check_below(by_track.count, "tracks: of starts", tracks);
     check_below(by_keyframe.count, "keyframes: of row_starts", keyframes);
-    for (size_t k = by_keyframe.count; k-- > 1;) {
+    for (const int64_t k : order) {
       int64_t repeated = 0;
-      for (const int64_t at : by_keyframe[k]) repeated += other_visits(row_of[at]) >= visits;
-      spare[k] = repeated >= least && double(repeated) >= share * double(by_keyframe.size(k));
+      for (const int64_t at : by_keyframe[size_t(k)]) repeated += other_visits(row_of[at]) >= visits;
+      gone[size_t(k)] = repeated >= least && double(repeated) >= share * double(by_keyframe.size(size_t(k)));
     }
   });
-  return as_numpy<bool>(std::move(spare));
+  return as_numpy<bool>(std::move(gone));
 }
 
 // Marks the less observed landmark of every near pair, in their order, that could be one landmark: by their places and sigmas, by their
@@ -130,37 +132,6 @@ auto duplicate_landmarks(const Array<int64_t, -1, 2>& near, const Points& points
   return as_numpy<bool>(std::move(duplicate));
 }
 
-// Marks keyframes, checked in `order`, of whose observations a share is repeated by enough remaining keyframes, at the same or a
-// finer scale. rows: the observations of each keyframe that count; starts: those of each landmark. Source: Mur-Artal and Tardos 2015.
-auto redundant_keyframes(const Indices& order, const Indices& rows, const Indices& row_starts, const Numbers& obs_landmark,
-                         const Numbers& obs_keyframe, const Indices& octaves, const Indices& starts, int observers, double share) {
-  const size_t observed = obs_landmark.shape(0);
-  check_rows(observed, "obs_keyframe, octaves: one for each observation", obs_keyframe, octaves);
-  const Lists keyframes(row_starts, rows.shape(0), "row_starts: rising, of rows");
-  const Lists landmarks(starts, observed, "starts: rising, of observations");
-  std::vector<uint8_t> gone(keyframes.count);
-  const int32_t *const landmark_of = obs_landmark.data(), *const keyframe_of = obs_keyframe.data();
-  const int64_t *const octave_of = octaves.data(), *const row_of = rows.data();
-  unlocked([&] {
-    check_below(keyframes.count, "order: of keyframes", order);
-    check_below(observed, "rows: of observations", rows);
-    check_below(landmarks.count, "obs_landmark: of starts", obs_landmark);
-    check_below(keyframes.count, "obs_keyframe: of row_starts", obs_keyframe);
-    for (const int64_t k : order) {
-      int64_t repeated = 0;
-      for (const int64_t at : keyframes[size_t(k)]) {
-        const int64_t row = row_of[at];
-        int64_t others = -1;  // itself does not count
-        for (const int64_t m : landmarks[size_t(landmark_of[row])])
-          others += (octave_of[m] <= octave_of[row] || octave_of[m] - 1 == octave_of[row]) && !gone[size_t(keyframe_of[m])];
-        repeated += others >= observers;
-      }
-      gone[size_t(k)] = double(repeated) >= share * double(keyframes.size(size_t(k)));
-    }
-  });
-  return as_numpy<bool>(std::move(gone));
-}
-
 // The row of descriptors nearest to all others of its landmark, ties to the first; 0 for one without any.
 auto medoids(const Packed& packed, const Indices& starts) {
   const Lists landmarks(starts, packed.shape(0), "starts: rising, of descriptors");
@@ -176,7 +147,7 @@ auto medoids(const Packed& packed, const Indices& starts) {
       }
     }
   });
-  return as_numpy<int64_t>(std::move(chosen));
+  return chosen;
 }
 
 using Counts = MutableArray<int64_t, -1>;
@@ -279,12 +250,10 @@ auto twins(const Packed& packed, const Points& points_map, int reach, int most, 
 
 void bind_landmarks(nb::module_& module) {
   module.def("join_tracks", &join_tracks, "first"_a, "second"_a, "keyframes"_a);
-  module.def("spare_keyframes", &spare_keyframes, "rows"_a, "row_starts"_a, "tracks"_a, "starts"_a, "keyframes"_a, "octaves"_a, "gap"_a,
-             "visits"_a, "share"_a, "least"_a);
+  module.def("redundant_keyframes", &redundant_keyframes, "order"_a, "rows"_a, "row_starts"_a, "tracks"_a, "starts"_a, "keyframes"_a,
+             "octaves"_a, "gap"_a, "visits"_a, "share"_a, "least"_a);
   module.def("duplicate_landmarks", &duplicate_landmarks, "near"_a, "points_map"_a, "sigmas_m"_a, "starts"_a, "obs_keyframe"_a,
              "descriptors"_a, "most_bits"_a);
-  module.def("redundant_keyframes", &redundant_keyframes, "order"_a, "rows"_a, "row_starts"_a, "obs_landmark"_a, "obs_keyframe"_a,
-             "octaves"_a, "starts"_a, "observers"_a, "share"_a);
   module.def("medoids", &medoids, "descriptors"_a, "starts"_a);
   module.def("choose_landmarks", &choose_landmarks, "candidates"_a, "starts"_a, "bins"_a, "weights"_a, "cells"_a, "room"_a, "limit"_a,
              "counts"_a, "chosen"_a, "needs"_a, "bins_per_view"_a);

@@ -1,6 +1,7 @@
 // Vectors and rotations in space. Sums go from left to right, so that every compiler and every processor gives the same bits.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 
 namespace fleetmap {
@@ -19,7 +20,10 @@ inline Vec3 operator/(Vec3 a, double s) { return {a[0] / s, a[1] / s, a[2] / s};
 inline double dot(Vec3 a, Vec3 b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 inline double norm(Vec3 a) { return std::sqrt(dot(a, a)); }
 inline Vec3 cross(Vec3 a, Vec3 b) { return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}; }
-inline Vec3 vec3(const double* from) { return {from[0], from[1], from[2]}; }
+template <typename Real>
+inline Vec3 vec3(const Real* from) {
+  return {from[0], from[1], from[2]};
+}
 inline void store(Vec3 a, double* to) { to[0] = a[0], to[1] = a[1], to[2] = a[2]; }
 
 // Row by row: m[row][column].
@@ -152,6 +156,23 @@ inline void store(const SE3& a, double* matrix) {
   store(a.rotation, matrix, 4);
   for (int i = 0; i < 3; ++i) matrix[4 * i + 3] = a.translation[i], matrix[12 + i] = 0.0;
   matrix[15] = 1.0;
+}
+
+// Covariance or information (6, 6) of a pose: rotation, then translation.
+struct Mat6 {
+  double at[36];
+  double* operator[](int row) { return at + 6 * row; }
+  const double* operator[](int row) const { return at + 6 * row; }
+};
+inline Mat6 operator+(Mat6 a, const Mat6& b) {
+  for (int k = 0; k < 36; ++k) a.at[k] += b.at[k];
+  return a;
+}
+inline void store(const Mat6& a, double* to) { std::copy_n(a.at, 36, to); }
+inline Mat6 mat6(const double* from) {
+  Mat6 out;
+  std::copy_n(from, 36, out.at);
+  return out;
 }
 
 }  // namespace fleetmap

@@ -75,34 +75,14 @@ struct Nearest {
 Pairs returned(const std::vector<int64_t>& choice, const Claims& claims) {
   Pairs pairs;
   for (size_t i = 0; i < choice.size(); ++i)
-    if (choice[i] >= 0 && claims.row[size_t(choice[i])] == int64_t(i)) pairs.emplace_back(int64_t(i), choice[i]);
+    if (choice[i] >= 0 && claims.row[size_t(choice[i])] == int64_t(i)) pairs.push_back({int64_t(i), choice[i]});
   return pairs;
 }
 
 // Pairs that are each other's nearest, by rising index in a: at most max_distance apart, and below ratio times the distance of
-// a's second nearest. Ties go to the lower index. Source: Lowe 2004.
-Pairs mutual_pairs(Descriptors a, Descriptors b, int max_distance, double ratio) {
-  const Columns columns(b);
-  Claims claims(b.count);
-  std::vector<int32_t> scratch(b.count);
-  std::vector<int64_t> choice(a.count, -1);
-  run_popcount([&]() __attribute__((always_inline)) {
-    for (size_t i = 0; i < a.count; ++i) {
-      Nearest nearest;
-      compare_row(a[i], int64_t(i), columns, 0, b.count, scratch, claims, nearest);
-      if (nearest.passes(max_distance, ratio)) choice[i] = nearest.found;
-    }
-  });
-  return returned(choice, claims);
-}
-
-auto mutual(const Packed& a, const Packed& b, int max_distance, double ratio) {
-  return as_numpy<int64_t>(unlocked([&] { return mutual_pairs(a, b, max_distance, ratio); }));
-}
-
-// As mutual, of each of a with those of b whose node is one of its two: nodes_a holds two numbers for each of a, nodes_b one
-// for each of b, none negative. Source: direct index, Galvez-Lopez and Tardos 2012, section III-B.
-Pairs mutual_pairs_within(Descriptors a, const int32_t* nodes_a, Descriptors b, const int32_t* nodes_b, int max_distance, double ratio) {
+// a's second nearest, of each of a with those of b whose node is one of its two: nodes_a holds two numbers for each of a, nodes_b one
+// for each of b, none negative. Ties go to the lower index. Sources: Lowe 2004; direct index, Galvez-Lopez and Tardos 2012, section III-B.
+Pairs mutual_pairs(Descriptors a, const int32_t* nodes_a, Descriptors b, const int32_t* nodes_b, int max_distance, double ratio) {
   if (a.count == 0 || b.count == 0) return {};
   // b sorted by node: those of node n are the columns starts[n]..starts[n + 1].
   std::vector<int64_t> order(b.count);
@@ -135,12 +115,19 @@ Pairs mutual_pairs_within(Descriptors a, const int32_t* nodes_a, Descriptors b, 
   return pairs;
 }
 
-auto mutual_within(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, const Packed& b, const Numbers& nodes_b, int max_distance,
-                   double ratio) {
+Pairs mutual(const Packed& a, const Packed& b, int max_distance, double ratio) {
+  return unlocked([&] {
+    const std::vector<int32_t> nodes(std::max(2 * a.shape(0), b.shape(0)));  // one for all
+    return mutual_pairs(a, nodes.data(), b, nodes.data(), max_distance, ratio);
+  });
+}
+
+Pairs mutual_within(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, const Packed& b, const Numbers& nodes_b, int max_distance,
+                    double ratio) {
   constexpr size_t kMostNodes = 1 << 20;
   if (nodes_a.shape(0) != a.shape(0) || nodes_b.shape(0) != b.shape(0)) throw nb::value_error("a node for each descriptor is needed");
   check_below(kMostNodes, "nodes are numbers from 0 to 2^20", nodes_a, nodes_b);
-  return as_numpy<int64_t>(unlocked([&] { return mutual_pairs_within(a, nodes_a.data(), b, nodes_b.data(), max_distance, ratio); }));
+  return unlocked([&] { return mutual_pairs(a, nodes_a.data(), b, nodes_b.data(), max_distance, ratio); });
 }
 
 // For each descriptor, `cells` numbers of the centres nearest to it, the nearest first, -1 where there are fewer. Ties go to the lower

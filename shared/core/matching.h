@@ -1,10 +1,10 @@
 // Hamming distances of 256-bit descriptors, and matching by them near a predicted pixel.
 #pragma once
 
+#include <array>
 #include <bit>
 #include <cstddef>
 #include <cstdint>
-#include <utility>
 #include <vector>
 
 namespace fleetmap {
@@ -46,7 +46,7 @@ void run_popcount(const Loop& loop) {
 }
 #endif
 
-using Pairs = std::vector<std::pair<int64_t, int64_t>>;
+using Pairs = std::vector<std::array<int64_t, 2>>;
 
 // Predicted pixels and appearance of landmarks or features in an image; NaN excludes one from matching.
 struct Projections {

@@ -220,12 +220,11 @@ auto adjust_window(const Array<double, -1, 4, 4>& map_from_cam, size_t held, con
     window.views.push_back(se3(map_from_cam.data() + 16 * k));
     window.slots.push_back(k < held ? -1 : int64_t(k - held));
   }
-  for (size_t n = 0; n < count; ++n) window.points.push_back(vec3(&points(n, 0)));
+  window.points.assign(points.rows(), points.rows() + count);
   std::vector<double> squared(seen), moved(16 * view_count);
   const double cost = unlocked([&] { return adjusted(window, view_count - std::min(held, view_count), iterations, squared.data()); });
   for (size_t k = 0; k < view_count; ++k) store(window.views[k], moved.data() + 16 * k);
-  return std::tuple(as_numpy<double, 3>(std::move(moved), {view_count, 4, 4}), as_numpy<double>(std::move(window.points)),
-                    as_numpy<double>(std::move(squared)), cost);
+  return std::tuple(as_numpy<double, 3>(std::move(moved), {view_count, 4, 4}), std::move(window.points), std::move(squared), cost);
 }
 
 }  // namespace

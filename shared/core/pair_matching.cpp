@@ -23,7 +23,7 @@ struct KeyframeFeatures {
   const int8_t* octaves;
   Descriptors descriptors;
   const double* disparities;  // (N, 2) with their standard deviations, NaN unknown
-  const double* points_cam;   // (N, 3), by the disparities
+  const Vec3* points_cam;     // by the disparities
   bool is_measured;           // true if the keyframe measured the disparities itself
 
   explicit KeyframeFeatures(const Features& features)
@@ -31,7 +31,7 @@ struct KeyframeFeatures {
         octaves(std::get<1>(features).data()),
         descriptors(std::get<2>(features)),
         disparities(std::get<3>(features).data()),
-        points_cam(std::get<4>(features).data()),
+        points_cam(std::get<4>(features).rows()),
         is_measured(std::get<5>(features)) {
     check_rows(count(), "a, b: as many pixels, octaves, disparities and points as descriptors", std::get<0>(features),
                std::get<1>(features), std::get<3>(features), std::get<4>(features));
@@ -51,7 +51,7 @@ struct GuidedPair {
   int good = 0;                               // number of successful radii
   std::vector<std::array<int32_t, 2>> pairs;  // if all succeeded
   SE3 b_from_a;
-  double hessian[36] = {};
+  Mat6 hessian = {};
 };
 
 // By which pixels of an octave are coarser than the image's.
@@ -75,7 +75,7 @@ Pairs project_matches(const KeyframeFeatures& a, const KeyframeFeatures& b, cons
   std::vector<int64_t> span(2 * count, 0);
   for (size_t n = 0; n < count; ++n) {
     if (!std::isfinite(a.disparities[2 * n])) continue;
-    const Vec3 point = vec3(a.points_cam + 3 * n), in_b = b_from_a * point;
+    const Vec3 point = a.points_cam[n], in_b = b_from_a * point;
     const auto seen = seen_by(in_b, guidance.lens, guidance.size_px);
     if (!seen) continue;
     const double nearer = std::min(std::max(point[2] / std::max(in_b[2], 0.05), 0.1), 10.0);
@@ -90,27 +90,22 @@ Pairs project_matches(const KeyframeFeatures& a, const KeyframeFeatures& b, cons
                   guidance.max_distance, kRatio, found.data(), distances.data());
   Pairs pairs;
   for (size_t n = 0; n < count; ++n)
-    if (found[n] >= 0) pairs.emplace_back(int64_t(n), found[n]);
+    if (found[n] >= 0) pairs.push_back({int64_t(n), found[n]});
   return pairs;
 }
 
 // Whether the pairs give a motion, and their squared residuals.
 bool refine(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const Pairs& pairs, GuidedPair& found,
             std::vector<double>& squared) {
-  const size_t count = pairs.size();
-  std::vector<double> points(3 * count), pixels(3 * count), weights(2 * count);
-  squared.resize(count);
-  for (size_t n = 0; n < count; ++n) {
-    const auto [i, j] = pairs[n];
-    std::copy_n(a.points_cam + 3 * i, 3, points.data() + 3 * n);
-    const double u = b.pixels[2 * j], v = b.pixels[2 * j + 1], disparity = b.is_measured ? b.disparities[2 * j] : kNaN;
-    pixels[3 * n] = u, pixels[3 * n + 1] = v, pixels[3 * n + 2] = u - disparity;
-    const double coarse = coarseness(b.octaves[j]);
-    weights[2 * n] = 1.0 / (guidance.sigma_px * coarse), weights[2 * n + 1] = 1.0 / std::max(guidance.sigma_px, coarse);
+  ChosenSightings seen, inliers;
+  squared.resize(pairs.size());
+  for (const auto& [i, j] : pairs) {
+    const double u = b.pixels[2 * j], disparity = b.is_measured ? b.disparities[2 * j] : kNaN, coarse = coarseness(b.octaves[j]);
+    const Vec3 pixel = {u, b.pixels[2 * j + 1], u - disparity};
+    const std::array<double, 2> weights = {1.0 / (guidance.sigma_px * coarse), 1.0 / std::max(guidance.sigma_px, coarse)};
+    seen.add({a.points_cam + i, &pixel, &weights, 1}, 0);
   }
-  ChosenSightings inliers;
-  return refine_twice({points.data(), pixels.data(), weights.data(), count}, guidance.lens, guidance.refinement, nullptr, found.b_from_a,
-                      found.hessian, squared.data(), inliers);
+  return refine_twice(seen.all(), guidance.lens, guidance.refinement, {}, found.b_from_a, found.hessian, squared.data(), inliers);
 }
 
 // The matches of a into b, and those of b into a whose features they leave free.
@@ -156,7 +151,7 @@ auto match_guided(const Features& a, const Features& b, const SE3& b_from_a, con
   const KeyframeFeatures ours(a), theirs(b);
   GuidedPair found =
       unlocked([&] { return guided(ours, theirs, guidance, b_from_a, {radii_px.begin(), radii_px.end()}, least_inliers, least_share); });
-  return std::tuple(found.good, as_numpy<int32_t>(std::move(found.pairs)), found.b_from_a, copied<2>(found.hessian, {6, 6}));
+  return std::tuple(found.good, std::move(found.pairs), found.b_from_a, found.hessian);
 }
 
 // Share of a's points with a disparity in view of b, at a similar distance.
@@ -168,7 +163,7 @@ double share_in_view(const SE3& b_from_a, const Points& points_a, const Places& 
     for (size_t n = 0; n < points_a.shape(0); ++n) {
       if (!std::isfinite(disparities_a(n, 0))) continue;
       ++known;
-      const Vec3 point = vec3(&points_a(n, 0)), in_b = b_from_a * point;
+      const Vec3 point = points_a.rows()[n], in_b = b_from_a * point;
       const double farther = in_b[2] / point[2];
       seen += 0.4 < farther && farther < 2.5 && seen_by(in_b, lens, size_px);
     }

@@ -232,8 +232,8 @@ Warp warp_from_features(int octave_reference, double angle_reference_deg, int oc
 using Features = std::tuple<Pyramid, Places, Octaves, Array<float, -1>, Indices>;
 
 // Places (N, 3) x, y, sigma_px in the own image; the warps are those of the motion, or of octaves and angles where it is degenerate.
-auto align_features(const Features& reference, const Features& own, const Points& points_reference, const SE3& own_from_reference,
-                    int half, double max_shift_px, double min_correlation) {
+auto align_features(const Features& reference, const Features& own, const Points& points_reference, const SE3& own_from_reference, int half,
+                    double max_shift_px, double min_correlation) {
   const PatchLimits limits(half, max_shift_px, min_correlation);
   const auto& [pyramid_a, pixels_a, octaves_a, angles_a, chosen_a] = reference;
   const auto& [pyramid_b, pixels_b, octaves_b, angles_b, chosen_b] = own;
@@ -255,7 +255,7 @@ auto align_features(const Features& reference, const Features& own, const Points
       found[n] = {at.x, at.y, at.sigma_px};
     }
   });
-  return as_numpy<double>(std::move(found));
+  return found;
 }
 
 }  // namespace

@@ -20,14 +20,15 @@ constexpr double kUnseenShare = 1e-9;
 // Robust cost, and the normal equations of a step.
 struct Normal {
   double cost;
-  double hessian[6][6], gradient[6];
+  Mat6 hessian;
+  double gradient[6];
 };
 
 // At a camera; fills squared normalised residuals (count,) too.
 void linearize(const Sightings& seen, const StereoLens& lens, double width, const SE3& cam_from_source, Normal& normal, double* squared) {
   normal = {};
   for (size_t n = 0; n < seen.count; ++n) {
-    const Vec3 from_first = cam_from_source * vec3(seen.points + 3 * n);
+    const Vec3 from_first = cam_from_source * seen.points[n];
     const SE3* const camera = seen.cameras_from_first == nullptr ? nullptr : seen.cameras_from_first + seen.cameras[n];
     const Vec3 point = camera == nullptr ? from_first : *camera * from_first;
     const double x = point[0], y = point[1], z = point[2];
@@ -36,9 +37,10 @@ void linearize(const Sightings& seen, const StereoLens& lens, double width, cons
       normal.cost += 0.5 * width * width;
       continue;
     }
-    const double *pixel = seen.pixels + 3 * n, inverse = 1.0 / z;
+    const Vec3 pixel = seen.pixels[n];
+    const double inverse = 1.0 / z;
     const bool is_stereo = !std::isnan(pixel[2]) && lens.focal_baseline > 0.0;
-    const double w = seen.weights[2 * n], w_disparity = is_stereo ? seen.weights[2 * n + 1] : 0.0;
+    const double w = seen.weights[n][0], w_disparity = is_stereo ? seen.weights[n][1] : 0.0;
     const double residual[3] = {(lens.focal * x * inverse + lens.cx - pixel[0]) * w, (lens.focal * y * inverse + lens.cy - pixel[1]) * w,
                                 is_stereo ? (lens.focal_baseline * inverse - (pixel[0] - pixel[2])) * w_disparity : 0.0};
     // d residual / d point, and by the step: the point moves by turn x point + shift.
@@ -64,7 +66,7 @@ void linearize(const Sightings& seen, const StereoLens& lens, double width, cons
 }
 
 // Levenberg-Marquardt in place; leaves the final normal equations and squared residuals. False if those are singular.
-bool refine(const Sightings& seen, const StereoLens& lens, double width, const double* prior, int iterations, SE3& cam_from_source,
+bool refine(const Sightings& seen, const StereoLens& lens, double width, const Mat6& prior, int iterations, SE3& cam_from_source,
             Normal& normal, double* squared) {
   double moved[6] = {}, damping = 1e-4;
   linearize(seen, lens, width, cam_from_source, normal, squared);
@@ -74,16 +76,17 @@ bool refine(const Sightings& seen, const StereoLens& lens, double width, const d
     double moved_then[6];
     bool is_better = false;
     for (int k = 0; k < kTrials && !is_better; ++k) {
-      double damped[36], step[6];
+      Mat6 damped;
+      double step[6];
       for (int a = 0; a < 6; ++a) {
         step[a] = normal.gradient[a];
         for (int b = 0; b < 6; ++b) {
-          damped[6 * a + b] = normal.hessian[a][b] + prior[6 * a + b];
-          step[a] -= prior[6 * a + b] * moved[b];
+          damped[a][b] = normal.hessian[a][b] + prior[a][b];
+          step[a] -= prior[a][b] * moved[b];
         }
-        damped[7 * a] += damping * normal.hessian[a][a] + 1e-9;
+        damped[a][a] += damping * normal.hessian[a][a] + 1e-9;
       }
-      if (!solve_spd(damped, step, 6, 6)) return false;
+      if (!solve_spd(damped.at, step, 6, 6)) return false;
       const Mat3 turn = so3_exp(vec3(step));
       stepped.rotation = turn * cam_from_source.rotation;
       for (int a = 0; a < 3; ++a) {
@@ -93,7 +96,7 @@ bool refine(const Sightings& seen, const StereoLens& lens, double width, const d
       linearize(seen, lens, width, stepped, trial, squared);
       for (int a = 0; a < 6; ++a) moved_then[a] = moved[a] + step[a];
       for (int a = 0; a < 6; ++a)
-        for (int b = 0; b < 6; ++b) trial.cost += 0.5 * moved_then[a] * prior[6 * a + b] * moved_then[b];
+        for (int b = 0; b < 6; ++b) trial.cost += 0.5 * moved_then[a] * prior[a][b] * moved_then[b];
       is_better = trial.cost <= normal.cost;
       if (!is_better) damping *= 10.0;
     }
@@ -108,21 +111,17 @@ bool refine(const Sightings& seen, const StereoLens& lens, double width, const d
     damping = std::max(0.1 * damping, 1e-9);
     if (gain < kEnough * (normal.cost + 1e-9)) break;
   }
-  double information[36];
+  Mat6 factor = normal.hessian + prior;
+  if (!cholesky_in_place(factor.at, 6, 6)) return false;
   for (int a = 0; a < 6; ++a)
-    for (int b = 0; b < 6; ++b) information[6 * a + b] = normal.hessian[a][b] + prior[6 * a + b];
-  if (!cholesky_in_place(information, 6, 6)) return false;
-  for (int a = 0; a < 6; ++a)
-    if (information[7 * a] * information[7 * a] < kUnseenShare * (normal.hessian[a][a] + prior[7 * a])) return false;
+    if (factor[a][a] * factor[a][a] < kUnseenShare * (normal.hessian[a][a] + prior[a][a])) return false;
   return true;
 }
 
 }  // namespace
 
-bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
-                  double* hessian, double* squared, ChosenSightings& inliers) {
-  constexpr double kNoPrior[36] = {};
-  if (prior == nullptr) prior = kNoPrior;
+bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Mat6& prior, SE3& cam_from_source,
+                  Mat6& hessian, double* squared, ChosenSightings& inliers) {
   Normal normal;
   if (!refine(seen, lens, refinement.width, prior, refinement.iterations, cam_from_source, normal, squared)) return false;
   inliers.clear();
@@ -134,17 +133,16 @@ bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinemen
     Normal of_all;
     linearize(seen, lens, refinement.width, cam_from_source, of_all, squared);
   }
-  std::copy_n(&normal.hessian[0][0], 36, hessian);
+  hessian = normal.hessian;
   return true;
 }
 
-std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
+std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Mat6& prior,
                                     const SE3& start) {
   Resection found{start, {}, std::vector<double>(seen.count)};
   ChosenSightings inliers;
   if (!refine_twice(seen, lens, refinement, prior, found.cam_from_source, found.information, found.squared.data(), inliers)) return {};
-  if (prior != nullptr)
-    for (int k = 0; k < 36; ++k) found.information[k] += prior[k];
+  found.information = found.information + prior;
   return found;
 }
 

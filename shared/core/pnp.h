@@ -1,6 +1,7 @@
 // The pose of one camera from points with known positions (PnP), or of several that are held together: a generalised camera.
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <optional>
@@ -13,9 +14,8 @@ namespace fleetmap {
 
 // Points with known positions, and the pixels where a camera sees them.
 struct Sightings {
-  const double* points;   // (count, 3) in the source frame, metres
-  const double* pixels;   // (count, 3) u left, v, u right (NaN none)
-  const double* weights;  // (count, 2) 1 / sigma of u and v, of the disparity; 1 / pixels
+  const Vec3 *points, *pixels;           // in the source frame, metres; u left, v, u right (NaN none)
+  const std::array<double, 2>* weights;  // 1 / sigma of u and v, of the disparity; 1 / pixels
   size_t count;
   // Where several cameras see them: the number of each sighting's camera, and those cameras from the first one, whose pose is sought.
   // Source: Pless 2003 (generalised cameras).
@@ -25,19 +25,18 @@ struct Sightings {
 
 // Sightings that are chosen one by one.
 struct ChosenSightings {
-  std::vector<double> points, pixels, weights;
+  std::vector<Vec3> points, pixels;
+  std::vector<std::array<double, 2>> weights;
   std::vector<uint8_t> cameras;
   const SE3* cameras_from_first = nullptr;
 
   void add(const Sightings& from, size_t n) {
-    points.insert(points.end(), from.points + 3 * n, from.points + 3 * n + 3);
-    pixels.insert(pixels.end(), from.pixels + 3 * n, from.pixels + 3 * n + 3);
-    weights.insert(weights.end(), from.weights + 2 * n, from.weights + 2 * n + 2);
+    points.push_back(from.points[n]), pixels.push_back(from.pixels[n]), weights.push_back(from.weights[n]);
     cameras.push_back(from.cameras == nullptr ? 0 : from.cameras[n]);
     cameras_from_first = from.cameras_from_first;
   }
   void clear() { points.clear(), pixels.clear(), weights.clear(), cameras.clear(); }
-  Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size() / 3, cameras.data(), cameras_from_first}; }
+  Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size(), cameras.data(), cameras_from_first}; }
 };
 
 // The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared
@@ -49,22 +48,21 @@ struct Refinement {
 
 // Robust least squares from a start, cam_from_source, in place: Levenberg-Marquardt on all points, and once more on the inliers alone, so
 // that no outlier biases the result. False where the points do not determine the camera.
-// The step is rotation first, applied from the left in camera axes; prior (6, 6): information on the start (no pointer: none).
-// Fills the last Hessian (6, 6), without the prior, and the squared normalised residuals (count,) of all points; inliers are memory to
-// reuse.
+// The step is rotation first, applied from the left in camera axes; prior: information on the start. Fills the last Hessian, without the
+// prior, and the squared normalised residuals (count,) of all points; inliers are memory to reuse.
 // Source: Geman and McClure 1987 for the weight, Marquardt 1963 for the damping.
-bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
-                  double* hessian, double* squared, ChosenSightings& inliers);
+bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Mat6& prior, SE3& cam_from_source,
+                  Mat6& hessian, double* squared, ChosenSightings& inliers);
 
-// A solved camera: the information (6, 6), with the prior, on a perturbation as that of the steps, and the squared normalised residuals.
+// A solved camera: the information, with the prior, on a perturbation as that of the steps, and the squared normalised residuals.
 struct Resection {
   SE3 cam_from_source;
-  double information[36];
+  Mat6 information;
   std::vector<double> squared;
 };
 
 // As refine_twice.
-std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
+std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Mat6& prior,
                                     const SE3& start);
 
 // A proposed camera must see a minimum of points within a limit in pixels of their measurements, and keep as many inliers
@@ -74,10 +72,10 @@ struct Agreement {
   size_t min_inliers;
 };
 
-// The camera that most points agree with, of those that three of them allow: draws (count, 3) in [0, 1) say which three propose. Fewer
+// The camera that most points agree with, of those that three of them allow: draws in [0, 1) say which three propose. Fewer
 // are tried once the best camera is the best of all with that confidence.
 // Source: Fischler and Bolles 1981; Grunert 1841, as in Haralick et al. 1994, for the three points.
 std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Agreement& agreement,
-                                    const double* draws, size_t draw_count, double confidence);
+                                    const Vec3* draws, size_t draw_count, double confidence);
 
 }  // namespace fleetmap

@@ -15,7 +15,7 @@ struct Columns {
 
   explicit Columns(const Sightings& seen) : x(seen.count), y(seen.count), z(seen.count), u(seen.count), v(seen.count) {
     for (size_t n = 0; n < seen.count; ++n) {
-      const double *point = seen.points + 3 * n, *pixel = seen.pixels + 3 * n;
+      const Vec3 point = seen.points[n], pixel = seen.pixels[n];
       x[n] = point[0], y[n] = point[1], z[n] = point[2], u[n] = pixel[0], v[n] = pixel[1];
     }
   }
@@ -98,8 +98,7 @@ bool axes_of(const Vec3 (&points)[3], Mat3& axes) {
   const Vec3 along = points[1] - points[0], other = points[2] - points[0], normal = cross(along, other);
   const double length = norm(along), height = norm(normal);
   if (!(height > 1e-4 * length * norm(other))) return false;
-  const Vec3 x{along[0] / length, along[1] / length, along[2] / length}, z{normal[0] / height, normal[1] / height, normal[2] / height};
-  const Vec3 y = cross(z, x);
+  const Vec3 x = along / length, z = normal / height, y = cross(z, x);
   axes = {{{x[0], y[0], z[0]}, {x[1], y[1], z[1]}, {x[2], y[2], z[2]}}};
   return true;
 }
@@ -143,7 +142,7 @@ int three_point(const Vec3 (&points)[3], const Vec3 (&rays)[3], SE3 (&cameras)[4
 struct Three {
   size_t i, j, k;
 
-  Three(const double* draw, size_t size)
+  Three(Vec3 draw, size_t size)
       : i(size_t(draw[0] * double(size))), j(size_t(draw[1] * double(size - 1))), k(size_t(draw[2] * double(size - 2))) {
     if (j >= i) ++j;
     if (k >= std::min(i, j)) ++k;
@@ -153,11 +152,11 @@ struct Three {
 
 // Refinement by the points that a start sees near their pixels, then by all.
 std::optional<Resection> refine_from(const SE3& start, const Sightings& seen, const StereoLens& lens, const Refinement& refinement,
-                                     const double* prior, const Agreement& agreement) {
+                                     const Mat6& prior, const Agreement& agreement) {
   ChosenSightings near;
   for (size_t n = 0; n < seen.count; ++n) {
-    const Vec3 point = start * vec3(seen.points + 3 * n);
-    const double *pixel = seen.pixels + 3 * n, z = point[2];
+    const Vec3 point = start * seen.points[n], pixel = seen.pixels[n];
+    const double z = point[2];
     const double du = lens.focal * point[0] / z + lens.cx - pixel[0], dv = lens.focal * point[1] / z + lens.cy - pixel[1];
     if (z > 1e-6 && std::sqrt(du * du + dv * dv) < agreement.threshold_px) near.add(seen, n);
   }
@@ -172,7 +171,7 @@ std::optional<Resection> refine_from(const SE3& start, const Sightings& seen, co
 }  // namespace
 
 std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Agreement& agreement,
-                                    const double* draws, size_t draw_count, double confidence) {
+                                    const Vec3* draws, size_t draw_count, double confidence) {
   const size_t size = seen.count;
   if (size < std::max<size_t>(agreement.min_inliers, 4)) return {};
   const Columns columns(seen);
@@ -186,9 +185,8 @@ std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& len
   SE3 best_camera{}, cameras[4];
   double needed = double(draw_count);
   for (size_t tried = 0; double(tried) < needed; ++tried) {
-    const Three at(draws + 3 * tried, size);
-    const Vec3 points[3] = {vec3(seen.points + 3 * at.i), vec3(seen.points + 3 * at.j), vec3(seen.points + 3 * at.k)};
-    const int proposed = three_point(points, {rays[at.i], rays[at.j], rays[at.k]}, cameras);
+    const auto [i, j, k] = Three(draws[tried], size);
+    const int proposed = three_point({seen.points[i], seen.points[j], seen.points[k]}, {rays[i], rays[j], rays[k]}, cameras);
     for (int m = 0; m < proposed; ++m) {
       const size_t count = votes(columns, cameras[m], lens, agreement.threshold_px, best);
       if (count <= best) continue;
@@ -198,7 +196,7 @@ std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& len
     }
   }
   if (best < std::max<size_t>(agreement.min_inliers, 1)) return {};
-  return refine_from(best_camera, seen, lens, refinement, nullptr, agreement);
+  return refine_from(best_camera, seen, lens, refinement, {}, agreement);
 }
 
 namespace {
@@ -210,13 +208,14 @@ std::optional<Resection> with_rotation(const Sightings& seen, const StereoLens& 
   if (seen.count < agreement.min_inliers) return {};
   Columns columns(seen);  // of the points turned into the camera's axes
   for (size_t n = 0; n < seen.count; ++n) {
-    const Vec3 turned = rotation * vec3(seen.points + 3 * n);
+    const Vec3 turned = rotation * seen.points[n];
     columns.x[n] = turned[0], columns.y[n] = turned[1], columns.z[n] = turned[2];
   }
   size_t best = 0;
   SE3 best_camera{rotation, {}};
   for (size_t k = 0; k < seen.count; ++k) {
-    const double *pixel = seen.pixels + 3 * k, depth = lens.focal_baseline / (pixel[0] - pixel[2]);
+    const Vec3 pixel = seen.pixels[k];
+    const double depth = lens.focal_baseline / (pixel[0] - pixel[2]);
     if (std::isnan(depth)) continue;
     const Vec3 own{(pixel[0] - lens.cx) * depth / lens.focal, (pixel[1] - lens.cy) * depth / lens.focal, depth};
     const Vec3 translation = own - Vec3{columns.x[k], columns.y[k], columns.z[k]};
@@ -224,30 +223,30 @@ std::optional<Resection> with_rotation(const Sightings& seen, const StereoLens& 
     if (count > best) best = count, best_camera.translation = translation;
   }
   if (best < agreement.min_inliers) return {};
-  double prior[36] = {};
-  for (int a = 0; a < 3; ++a) prior[7 * a] = 1.0 / (rotation_sigma_rad * rotation_sigma_rad);
+  Mat6 prior = {};
+  for (int a = 0; a < 3; ++a) prior[a][a] = 1.0 / (rotation_sigma_rad * rotation_sigma_rad);
   return refine_from(best_camera, seen, lens, refinement, prior, agreement);
 }
 
 Sightings sightings_of(const Points& points, const Points& pixels, const Places& weights) {
   check_rows(points.shape(0), "pixels and weights: one row for each point", pixels, weights);
-  return {points.data(), pixels.data(), weights.data(), points.shape(0)};
+  return {points.rows(), pixels.rows(), reinterpret_cast<const std::array<double, 2>*>(weights.data()), points.shape(0)};
 }
 
 Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
 
-using Result = std::optional<std::tuple<SE3, nb::ndarray<nb::numpy, double, nb::ndim<2>>, nb::ndarray<nb::numpy, double, nb::ndim<1>>>>;
+using Result = std::optional<std::tuple<SE3, Mat6, std::vector<double>>>;
 
 Result result_of(std::optional<Resection>&& found) {
   if (!found) return {};
-  return {{found->cam_from_source, copied<2>(found->information, {6, 6}), as_numpy<double>(std::move(found->squared))}};
+  return {{found->cam_from_source, found->information, std::move(found->squared)}};
 }
 
 Result refine_pnp_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& refinement,
-                     const SE3& cam_from_source, const std::optional<Array<double, 6, 6>>& prior) {
+                     const SE3& cam_from_source, const std::optional<Mat6>& prior) {
   const Sightings seen = sightings_of(points, pixels, weights);
   const Refinement limits = refinement_of(refinement);
-  return result_of(unlocked([&] { return refine_pnp(seen, lens, limits, prior ? prior->data() : nullptr, cam_from_source); }));
+  return result_of(unlocked([&] { return refine_pnp(seen, lens, limits, prior.value_or(Mat6{}), cam_from_source); }));
 }
 
 Result ransac_pnp_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& refinement,
@@ -257,7 +256,7 @@ Result ransac_pnp_of(const Points& points, const Points& pixels, const Places& w
     throw nb::value_error("draws: from 0 to below 1");
   const Refinement limits = refinement_of(refinement);
   return result_of(unlocked(
-      [&] { return ransac_pnp(seen, lens, limits, agreement_of(threshold_px, min_inliers), draws.data(), draws.shape(0), confidence); }));
+      [&] { return ransac_pnp(seen, lens, limits, agreement_of(threshold_px, min_inliers), draws.rows(), draws.shape(0), confidence); }));
 }
 
 Result pnp_with_rotation_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens,

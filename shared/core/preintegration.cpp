@@ -238,7 +238,7 @@ auto imu_intervals_of(const Indices& stamps_ns, const Points& gyro_radps, const 
   std::vector<double> durations_s;
   std::vector<Vec3> gyro, accel;
   for (const ImuInterval& each : intervals) durations_s.push_back(each.duration_s), gyro.push_back(each.gyro), accel.push_back(each.accel);
-  return std::tuple(as_numpy<double>(std::move(durations_s)), as_numpy<double>(std::move(gyro)), as_numpy<double>(std::move(accel)));
+  return std::tuple(std::move(durations_s), std::move(gyro), std::move(accel));
 }
 
 auto preintegrate(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2, int64_t start_ns, int64_t end_ns,

@@ -130,7 +130,7 @@ static auto match_projected_of(const Places& predicted, const Reals& radius_px, 
     match_projected({predicted.data(), radius_px.data(), octave_range.data(), a}, {pixels.data(), octaves.data(), b}, max_distance, ratio,
                     index.data(), distances.data());
   });
-  return std::tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(distances)));
+  return std::tuple(std::move(index), std::move(distances));
 }
 
 void bind_projection(nb::module_& module) {

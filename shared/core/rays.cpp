@@ -51,10 +51,80 @@ Hit enter_box(const YawedBox& box, Vec3 origin, Vec3 direction) {
 class BoxGrid {
  public:
   // The grid of boxes between two corners; parts outside are ignored.
-  BoxGrid(const Array<double, -1, 8>& boxes, const Vec3& low, const Vec3& high, double cell_m);
+  BoxGrid(const Array<double, -1, 8>& boxes, const Vec3& low, const Vec3& high, double cell_m) : low_(low), cell_m_(cell_m) {
+    constexpr double kMostCellsAlong = 4096, kMostCells = 1 << 24;
+    double cells = 1.0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const double along = std::ceil((high[axis] - low[axis]) / cell_m);
+      cells *= std::max(1.0, along);
+      if (along > kMostCellsAlong || cells > kMostCells) throw nb::value_error("low, high, cell_m: at most 2^24 cells, 4096 along an axis");
+      counts_[axis] = std::max<int64_t>(0, whole(along));
+    }
+    const nb::gil_scoped_release others_run;
+    for (const double* b = boxes.begin(); b < boxes.end(); b += 8) boxes_.push_back({vec3(b), vec3(b + 3), b[6], b[7]});
+    starts_.assign(size_t(counts_[0] * counts_[1] * counts_[2]) + 1, 0);
+    constexpr int64_t kMostItems = 1 << 26;
+    const auto for_each_cell = [&](const auto& visit) {
+      int64_t items = 0;
+      for (size_t b = 0; b < boxes_.size(); ++b) {
+        const YawedBox& box = boxes_[b];
+        const Vec3 reach = {std::abs(box.cosine) * box.half[0] + std::abs(box.sine) * box.half[1],
+                            std::abs(box.sine) * box.half[0] + std::abs(box.cosine) * box.half[1], box.half[2]};
+        int64_t first[3], last[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          first[axis] = std::max<int64_t>(0, whole(std::floor((box.centre[axis] - reach[axis] - low[axis]) / cell_m)));
+          last[axis] = std::min<int64_t>(counts_[axis] - 1, whole(std::floor((box.centre[axis] + reach[axis] - low[axis]) / cell_m)));
+        }
+        int64_t touched = 1;
+        for (int axis = 0; axis < 3; ++axis) touched *= std::max<int64_t>(0, last[axis] - first[axis] + 1);
+        if ((items += touched) > kMostItems) throw std::length_error("boxes: at most 2^26 in the lists of all cells");
+        for (int64_t k = first[2]; k <= last[2]; ++k)
+          for (int64_t j = first[1]; j <= last[1]; ++j)
+            for (int64_t i = first[0]; i <= last[0]; ++i) visit(size_t((k * counts_[1] + j) * counts_[0] + i), int32_t(b));
+      }
+    };
+    for_each_cell([&](size_t cell, int32_t) { ++starts_[cell + 1]; });
+    for (size_t cell = 1; cell < starts_.size(); ++cell) starts_[cell] += starts_[cell - 1];
+    items_.resize(size_t(starts_.back()));
+    std::vector<int64_t> next = starts_;
+    for_each_cell([&](size_t cell, int32_t b) { items_[size_t(next[cell]++)] = b; });
+  }
+
   // The nearest hit up to `farthest`, from an origin inside the grid and outside of the boxes, or any where that is enough (shadows).
   // Walks from cell to cell. Source: Amanatides and Woo 1987.
-  Hit cast(Vec3 origin, Vec3 direction, double farthest, bool is_any_enough, int64_t skipped_box) const;
+  Hit cast(Vec3 origin, Vec3 direction, double farthest, bool is_any_enough, int64_t skipped_box) const {
+    int64_t cell[3], step[3];
+    double crossing[3], spacing[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      cell[axis] = whole(std::floor((origin[axis] - low_[axis]) / cell_m_));
+      step[axis] = 0, crossing[axis] = spacing[axis] = kNever;
+      if (direction[axis] == 0.0) continue;
+      step[axis] = direction[axis] > 0.0 ? 1 : -1;
+      const double edge = double(cell[axis] + (direction[axis] > 0.0 ? 1 : 0));
+      crossing[axis] = (low_[axis] + edge * cell_m_ - origin[axis]) / direction[axis];
+      spacing[axis] = std::abs(cell_m_ / direction[axis]);
+    }
+    Hit nearest = {farthest, -1, -1};
+    const auto is_inside = [&](int axis) { return cell[axis] >= 0 && cell[axis] < counts_[axis]; };
+    while (is_inside(0) && is_inside(1) && is_inside(2)) {
+      const size_t index = size_t((cell[2] * counts_[1] + cell[1]) * counts_[0] + cell[0]);
+      for (int64_t slot = starts_[index]; slot < starts_[index + 1]; ++slot) {
+        const int32_t b = items_[size_t(slot)];
+        if (b == skipped_box) continue;
+        const Hit hit = enter_box(boxes_[size_t(b)], origin, direction);
+        if (!(hit.at < nearest.at)) continue;
+        nearest = {hit.at, b, hit.side};
+        if (is_any_enough) return nearest;
+      }
+      int axis = 0;
+      if (crossing[1] < crossing[axis]) axis = 1;
+      if (crossing[2] < crossing[axis]) axis = 2;
+      if (nearest.at <= crossing[axis] || crossing[axis] > farthest || step[axis] == 0) break;
+      cell[axis] += step[axis];
+      crossing[axis] += spacing[axis];
+    }
+    return nearest;
+  }
 
  private:
   std::vector<YawedBox> boxes_;
@@ -64,79 +134,6 @@ class BoxGrid {
   std::vector<int64_t> starts_;  // of each cell's list among items_
   std::vector<int32_t> items_;
 };
-
-BoxGrid::BoxGrid(const Array<double, -1, 8>& boxes, const Vec3& low, const Vec3& high, double cell_m) : low_(low), cell_m_(cell_m) {
-  constexpr double kMostCellsAlong = 4096, kMostCells = 1 << 24;
-  double cells = 1.0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const double along = std::ceil((high[axis] - low[axis]) / cell_m);
-    cells *= std::max(1.0, along);
-    if (along > kMostCellsAlong || cells > kMostCells) throw nb::value_error("low, high, cell_m: at most 2^24 cells, 4096 along an axis");
-    counts_[axis] = std::max<int64_t>(0, whole(along));
-  }
-  const nb::gil_scoped_release others_run;
-  for (const double* b = boxes.begin(); b < boxes.end(); b += 8) boxes_.push_back({vec3(b), vec3(b + 3), b[6], b[7]});
-  starts_.assign(size_t(counts_[0] * counts_[1] * counts_[2]) + 1, 0);
-  constexpr int64_t kMostItems = 1 << 26;
-  const auto for_each_cell = [&](const auto& visit) {
-    int64_t items = 0;
-    for (size_t b = 0; b < boxes_.size(); ++b) {
-      const YawedBox& box = boxes_[b];
-      const Vec3 reach = {std::abs(box.cosine) * box.half[0] + std::abs(box.sine) * box.half[1],
-                          std::abs(box.sine) * box.half[0] + std::abs(box.cosine) * box.half[1], box.half[2]};
-      int64_t first[3], last[3];
-      for (int axis = 0; axis < 3; ++axis) {
-        first[axis] = std::max<int64_t>(0, whole(std::floor((box.centre[axis] - reach[axis] - low[axis]) / cell_m)));
-        last[axis] = std::min<int64_t>(counts_[axis] - 1, whole(std::floor((box.centre[axis] + reach[axis] - low[axis]) / cell_m)));
-      }
-      int64_t touched = 1;
-      for (int axis = 0; axis < 3; ++axis) touched *= std::max<int64_t>(0, last[axis] - first[axis] + 1);
-      if ((items += touched) > kMostItems) throw std::length_error("boxes: at most 2^26 in the lists of all cells");
-      for (int64_t k = first[2]; k <= last[2]; ++k)
-        for (int64_t j = first[1]; j <= last[1]; ++j)
-          for (int64_t i = first[0]; i <= last[0]; ++i) visit(size_t((k * counts_[1] + j) * counts_[0] + i), int32_t(b));
-    }
-  };
-  for_each_cell([&](size_t cell, int32_t) { ++starts_[cell + 1]; });
-  for (size_t cell = 1; cell < starts_.size(); ++cell) starts_[cell] += starts_[cell - 1];
-  items_.resize(size_t(starts_.back()));
-  std::vector<int64_t> next = starts_;
-  for_each_cell([&](size_t cell, int32_t b) { items_[size_t(next[cell]++)] = b; });
-}
-
-Hit BoxGrid::cast(Vec3 origin, Vec3 direction, double farthest, bool is_any_enough, int64_t skipped_box) const {
-  int64_t cell[3], step[3];
-  double crossing[3], spacing[3];
-  for (int axis = 0; axis < 3; ++axis) {
-    cell[axis] = whole(std::floor((origin[axis] - low_[axis]) / cell_m_));
-    step[axis] = 0, crossing[axis] = spacing[axis] = kNever;
-    if (direction[axis] == 0.0) continue;
-    step[axis] = direction[axis] > 0.0 ? 1 : -1;
-    const double edge = double(cell[axis] + (direction[axis] > 0.0 ? 1 : 0));
-    crossing[axis] = (low_[axis] + edge * cell_m_ - origin[axis]) / direction[axis];
-    spacing[axis] = std::abs(cell_m_ / direction[axis]);
-  }
-  Hit nearest = {farthest, -1, -1};
-  const auto is_inside = [&](int axis) { return cell[axis] >= 0 && cell[axis] < counts_[axis]; };
-  while (is_inside(0) && is_inside(1) && is_inside(2)) {
-    const size_t index = size_t((cell[2] * counts_[1] + cell[1]) * counts_[0] + cell[0]);
-    for (int64_t slot = starts_[index]; slot < starts_[index + 1]; ++slot) {
-      const int32_t b = items_[size_t(slot)];
-      if (b == skipped_box) continue;
-      const Hit hit = enter_box(boxes_[size_t(b)], origin, direction);
-      if (!(hit.at < nearest.at)) continue;
-      nearest = {hit.at, b, hit.side};
-      if (is_any_enough) return nearest;
-    }
-    int axis = 0;
-    if (crossing[1] < crossing[axis]) axis = 1;
-    if (crossing[2] < crossing[axis]) axis = 2;
-    if (nearest.at <= crossing[axis] || crossing[axis] > farthest || step[axis] == 0) break;
-    cell[axis] += step[axis];
-    crossing[axis] += spacing[axis];
-  }
-  return nearest;
-}
 
 // Parameters of the nearest hits of rays, and their boxes and sides.
 auto cast(const BoxGrid& grid, const Vec3& origin, const Points& directions, const Reals& farthest) {
@@ -150,7 +147,7 @@ auto cast(const BoxGrid& grid, const Vec3& origin, const Points& directions, con
       at[i] = hit.at, hits[i] = {hit.box, hit.side};
     }
   });
-  return std::tuple(as_numpy<double>(std::move(at)), as_numpy<int64_t>(std::move(hits)));
+  return std::tuple(std::move(at), std::move(hits));
 }
 
 // Adds the direct light of lamps (L, 5), x y z power group, to light (groups, samples) of faces: quads (F, 9) of origin, edge U and edge V;
@@ -191,7 +188,7 @@ void bake(const BoxGrid& grid, const Array<double, -1, 9>& quads, const Array<in
           if (cosine <= 0.0) continue;
           const double distance = std::sqrt(squared);
           cosine /= distance;
-          const Vec3 direction = {off[0] / distance, off[1] / distance, off[2] / distance};
+          const Vec3 direction = off / distance;
           if (has_shadows && grid.cast(origin, direction, distance, true, skipped).box >= 0) continue;
           const double fade = 1.0 - squared / (reach_m * reach_m);
           float& received = light_of[size_t(lamp[4]) * samples + sample];

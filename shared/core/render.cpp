@@ -121,45 +121,6 @@ Surfaces surfaces_of(const Lit& lit, const Chunks& chunks, int64_t textures) {
   return {quads.data(), values.data(), numbers.data(), light.data(), groups.data(), ranges.data(), bounds.data(), ranges.shape(0)};
 }
 
-// Paints the image of one camera. Holds that camera's buffers.
-class ScenePainter {
- public:
-  // rays (H, W, 4): a lens' x/z, y/z and their change per pixel, whose samples are looked up in the plane; no rows for a pinhole.
-  ScenePainter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays);
-  // Adds an instant's weighted picture to the canvas, which is of the rays' size, or of the plane's. cam_from_map: rotation.
-  void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map, int samples,
-           std::tuple<double, double> shift, double weight, int most_taps, double reflectance, const Points& shadows, bool wants_truth,
-           const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m);
-
- private:
-  struct Polygon {  // of a visible face: (u', v', 1/z) = h (x/z, y/z, 1), u = u' z; its outline in pixels, clipped
-    double h[9], corners[8][2];
-    int corner_count;
-    int32_t face;
-  };
-  struct View {
-    std::vector<Polygon> polygons;
-    std::vector<float> nearness;  // 1/z and visible polygon of each sample
-    std::vector<int32_t> owner;
-  };
-
-  void project(const Surfaces& surfaces, const Mat3& cam_from_map, Vec3 centre_map, bool is_mirrored, std::vector<Polygon>& polygons) const;
-  int clip_near(const Vec3* corners, bool needs_clipping, Polygon& polygon) const;
-  void paint(View& view, int samples, double shift_x, double shift_y, ptrdiff_t first_row);
-  ptrdiff_t first_floor_row(const Surfaces& surfaces, int samples) const;
-  const int32_t* through_lens(int samples);
-  void shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m, const Instant& instant,
-                   const Canvas& canvas) const;
-
-  Plane plane_;
-  std::vector<std::array<float, 4>> rays_;
-  ptrdiff_t rows_, columns_;  // of the picture
-  View direct_, mirrored_;
-  std::vector<double> low_, high_;               // ends of a polygon in each row
-  std::array<std::vector<int32_t>, 5> indices_;  // of each sample in the plane, -1 outside, by samples
-  std::vector<int32_t> seen_;
-};
-
 // Bounds of x/z and y/z in a plane.
 struct Limits {
   double left, right, above, below;
@@ -186,163 +147,6 @@ bool is_box_outside(const double* bounds, double sign_z, const Mat3& cam_from_ma
     outside.add(cam_from_map * (Vec3{bounds[corner & 1 ? 3 : 0], bounds[corner & 2 ? 4 : 1], sign_z * bounds[corner & 4 ? 5 : 2]} - centre),
                 limits);
   return outside.wholly();
-}
-
-ScenePainter::ScenePainter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays)
-    : plane_(plane), rows_(plane_.height), columns_(plane_.width) {
-  if (rays.size() == 0) return;
-  rows_ = ptrdiff_t(rays.shape(0)), columns_ = ptrdiff_t(rays.shape(1));
-  rays_.resize(size_t(rows_ * columns_));
-  for (size_t i = 0; i < rays_.size(); ++i) std::copy_n(rays.data() + 4 * i, 4, rays_[i].begin());
-}
-
-// The faces that may be seen; is_mirrored: of the world reflected in the floor, z -> -z.
-void ScenePainter::project(const Surfaces& surfaces, const Mat3& cam_from_map, Vec3 centre_map, bool is_mirrored,
-                           std::vector<Polygon>& polygons) const {
-  const double sign_z = is_mirrored ? -1.0 : 1.0;
-  const Limits limits = {(-0.5 - plane_.cx) / plane_.fx, (double(plane_.width) - 0.5 - plane_.cx) / plane_.fx,
-                         (-0.5 - plane_.cy) / plane_.fy, (double(plane_.height) - 0.5 - plane_.cy) / plane_.fy};
-  polygons.clear();
-  for (size_t chunk = 0; chunk < surfaces.chunks; ++chunk) {
-    if (is_box_outside(surfaces.bounds + 6 * chunk, sign_z, cam_from_map, centre_map, limits)) continue;
-    for (int32_t f = surfaces.ranges[2 * chunk]; f < surfaces.ranges[2 * chunk + 1]; ++f) {
-      const double* quad = surfaces.quads + 9 * size_t(f);
-      const Vec3 origin = Vec3{quad[0], quad[1], sign_z * quad[2]} - centre_map;
-      const Vec3 u = {quad[3], quad[4], sign_z * quad[5]}, v = {quad[6], quad[7], sign_z * quad[8]};
-      // The outward normal against the direction to the face; a reflection turns the handedness.
-      if (dot(cross(v, u), origin) * sign_z >= -1e-9) continue;
-      const Vec3 a = cam_from_map * u, b = cam_from_map * v, c = cam_from_map * origin;
-      const Vec3 corners[4] = {c, c + a, c + a + b, c + b};
-      Outside outside;
-      for (const Vec3& corner : corners) outside.add(corner, limits);
-      if (outside.wholly()) continue;
-      // Rows of the inverse of the matrix [U V O] in camera axes, by cross products.
-      const Vec3 x = cross(b, c), y = cross(c, a), z = cross(a, b);
-      const double determinant = dot(a, x);
-      if (std::abs(determinant) < 1e-15) continue;
-      const double scale = 1.0 / determinant;
-      Polygon& polygon = polygons.emplace_back();
-      store(scale * x, polygon.h), store(scale * y, polygon.h + 3), store(scale * z, polygon.h + 6);
-      polygon.corner_count = clip_near(corners, outside.behind > 0, polygon);
-      polygon.face = f;
-    }
-  }
-}
-
-// Number of corners of the part of a quad in front of the near plane; fills the polygon's, in pixels.
-int ScenePainter::clip_near(const Vec3* corners, bool needs_clipping, Polygon& polygon) const {
-  const auto [fx, fy, cx, cy, width, height] = plane_;
-  if (!needs_clipping) {
-    for (int i = 0; i < 4; ++i) {
-      const double inverse = 1.0 / corners[i][2];
-      polygon.corners[i][0] = fx * corners[i][0] * inverse + cx, polygon.corners[i][1] = fy * corners[i][1] * inverse + cy;
-    }
-    return 4;
-  }
-  int count = 0;
-  const auto add = [&](double x, double y, double z) {
-    polygon.corners[count][0] = fx * x / z + cx, polygon.corners[count][1] = fy * y / z + cy;
-    ++count;
-  };
-  for (int i = 0; i < 4; ++i) {
-    const Vec3 from = corners[i], to = corners[(i + 1) & 3];
-    if (!(from[2] < kNearM)) add(from[0], from[1], from[2]);
-    if ((from[2] < kNearM) != (to[2] < kNearM)) {
-      const double share = (kNearM - from[2]) / (to[2] - from[2]);
-      add(from[0] + share * (to[0] - from[0]), from[1] + share * (to[1] - from[1]), kNearM);
-    }
-  }
-  return count;
-}
-
-// Paints the polygons, all convex, where they are nearest, from first_row on. Sample (i, j) lies at pixel
-// ((j + 0.5) / samples - 0.5 + shift x, same for i and y). Ends are inclusive, so that neighbours leave no crack.
-void ScenePainter::paint(View& view, int samples, double shift_x, double shift_y, ptrdiff_t first_row) {
-  const ptrdiff_t height = plane_.height * samples, width = plane_.width * samples;
-  view.nearness.assign(size_t(height * width), 0.0f), view.owner.assign(size_t(height * width), -1);
-  low_.resize(size_t(height)), high_.resize(size_t(height));
-  double *const low = low_.data(), *const high = high_.data();
-  const double step = 1.0 / samples, start_x = 0.5 * step - 0.5 + shift_x, start_y = 0.5 * step - 0.5 + shift_y;
-  for (size_t k = 0; k < view.polygons.size(); ++k) {
-    const Polygon& polygon = view.polygons[k];
-    double y_min = kNever, y_max = -kNever;
-    for (int i = 0; i < polygon.corner_count; ++i) {
-      const double y = (polygon.corners[i][1] - start_y) * samples;
-      y_min = std::min(y_min, y), y_max = std::max(y_max, y);
-    }
-    const ptrdiff_t top = std::max(first_row, whole(std::ceil(std::max(y_min, -1.0))));
-    const ptrdiff_t bottom = std::min(height - 1, whole(std::floor(std::min(y_max, double(height) + 1.0))));
-    for (ptrdiff_t row = top; row <= bottom; ++row) low[row] = kNever, high[row] = -kNever;
-    for (int i = 0; top <= bottom && i < polygon.corner_count; ++i) {
-      const int j = i + 1 < polygon.corner_count ? i + 1 : 0;
-      double px = (polygon.corners[i][0] - start_x) * samples, py = (polygon.corners[i][1] - start_y) * samples;
-      double qx = (polygon.corners[j][0] - start_x) * samples, qy = (polygon.corners[j][1] - start_y) * samples;
-      if (py > qy) std::swap(px, qx), std::swap(py, qy);
-      const ptrdiff_t first = std::max(top, whole(std::ceil(std::max(py, -1.0))));
-      const ptrdiff_t last = std::min(bottom, whole(std::floor(std::min(qy, double(height) + 1.0))));
-      if (first > last) continue;
-      if (qy <= py) {  // a level edge on a row of samples
-        low[first] = std::min(std::min(low[first], px), qx), high[first] = std::max(std::max(high[first], px), qx);
-        continue;
-      }
-      const double slope = (qx - px) / (qy - py);
-      for (ptrdiff_t row = first; row <= last; ++row) {
-        const double x = px + (double(row) - py) * slope;
-        low[row] = std::min(low[row], x), high[row] = std::max(high[row], x);
-      }
-    }
-    const double* h = polygon.h + 6;
-    const double w_x = h[0] / plane_.fx * step, w_y = h[1] / plane_.fy * step;
-    double w_0 = h[2] + h[0] * (start_x - plane_.cx) / plane_.fx;
-    w_0 += h[1] * (start_y - plane_.cy) / plane_.fy;
-    for (ptrdiff_t row = top; row <= bottom; ++row) {
-      if (high[row] < -0.5 || low[row] > double(width)) continue;
-      const int32_t first = int32_t(std::max<ptrdiff_t>(0, whole(std::ceil(low[row]))));
-      const int32_t last = int32_t(std::min(width - 1, whole(std::floor(std::min(high[row], double(width) + 1.0)))) + 1);
-      const float start = float(w_0 + w_y * double(row)), slope = float(w_x);  // of 32 bits, so that the loop is one over wide registers
-      float* __restrict nearness = view.nearness.data() + row * width;
-      int32_t* __restrict owner = view.owner.data() + row * width;
-      const int32_t number = int32_t(k);
-      for (int32_t x = first; x < last; ++x) {
-        const float w = start + slope * float(x);
-        const bool is_nearer = w > nearness[x];
-        nearness[x] = is_nearer ? w : nearness[x];
-        owner[x] = is_nearer ? number : owner[x];
-      }
-    }
-  }
-}
-
-// First row of pixels of the plane that shows floor in any eighth pixel, its height without one.
-ptrdiff_t ScenePainter::first_floor_row(const Surfaces& surfaces, int samples) const {
-  for (ptrdiff_t row = 0; row < plane_.height; ++row)
-    for (ptrdiff_t x = 0; x < plane_.width; x += 8) {
-      const int32_t k = direct_.owner[size_t(row * samples * plane_.width * samples + x * samples)];
-      if (k >= 0 && surfaces.numbers[6 * size_t(direct_.polygons[size_t(k)].face)] == kFloor) return row;
-    }
-  return plane_.height;
-}
-
-// The owner of each sample of the picture (H S, W S): that of the plane, through the lens if there is one.
-const int32_t* ScenePainter::through_lens(int samples) {
-  if (rays_.empty()) return direct_.owner.data();
-  std::vector<int32_t>& indices = indices_[size_t(samples)];
-  const ptrdiff_t width = plane_.width * samples, height = plane_.height * samples;
-  if (indices.empty()) {
-    indices.reserve(size_t(rows_ * columns_ * samples * samples));
-    for (ptrdiff_t y = 0; y < rows_ * samples; ++y)
-      for (ptrdiff_t x = 0; x < columns_ * samples; ++x) {
-        const auto [xn, yn, per_px_x, per_px_y] = rays_[size_t(y / samples * columns_ + x / samples)];
-        const double off_x = (double(x % samples) + 0.5) / samples - 0.5, off_y = (double(y % samples) + 0.5) / samples - 0.5;
-        const double column = std::floor(((xn + off_x * per_px_x) * plane_.fx + plane_.cx + 0.5) * samples);
-        const double row = std::floor(((yn + off_y * per_px_y) * plane_.fy + plane_.cy + 0.5) * samples);
-        const bool is_inside = column >= 0.0 && column < double(width) && row >= 0.0 && row < double(height);
-        indices.push_back(is_inside ? int32_t(row) * int32_t(width) + int32_t(column) : -1);
-      }
-  }
-  seen_.resize(indices.size());
-  for (size_t i = 0; i < indices.size(); ++i) seen_[i] = indices[i] >= 0 ? direct_.owner[size_t(indices[i])] : -1;
-  return seen_.data();
 }
 
 // A pixel's footprint on a texture: shift in texels per pixel to the right and down.
@@ -483,104 +287,286 @@ Shade shade(const Surfaces& surfaces, const Textures& textures, const double* h,
   return {grey * (1.0 / 255.0) * values[2] * received, u, v, w};
 }
 
-// Samples of one polygon in a pixel are shaded once, at their mean place; owner: that of each sample.
-void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m,
-                               const Instant& instant, const Canvas& canvas) const {
-  const int samples = instant.samples;
-  const double wide_x = 1.0 / plane_.fx, wide_y = 1.0 / plane_.fy, step = 1.0 / samples;
-  double per_px_x = wide_x, per_px_y = wide_y;
-  for (ptrdiff_t y = 0; y < rows_; ++y)
-    for (ptrdiff_t x = 0; x < columns_; ++x) {
-      // The polygons of the pixel's samples: number of samples of each, and the sums of their positions.
-      int32_t seen[kMostSamples];
-      int hits[kMostSamples], count = 1;
-      double sum_x[kMostSamples], sum_y[kMostSamples];
-      const int32_t* const corner = owner + (y * columns_ * samples + x) * samples;
-      const auto at = [&](int i, int j) { return corner[i * columns_ * samples + j]; };
-      seen[0] = at(0, 0), hits[0] = samples * samples, sum_x[0] = sum_y[0] = 0.5 * (samples - 1) * hits[0];
-      bool is_uniform = true;
-      for (int i = 0; i < samples; ++i)
-        for (int j = 0; j < samples; ++j) is_uniform &= at(i, j) == seen[0];
-      if (!is_uniform) {
-        count = 0;
-        for (int i = 0; i < samples; ++i)
-          for (int j = 0; j < samples; ++j) {
-            int n = 0;
-            while (n < count && seen[n] != at(i, j)) ++n;
-            if (n == count) seen[n] = at(i, j), hits[n] = 0, sum_x[n] = sum_y[n] = 0.0, ++count;
-            ++hits[n], sum_x[n] += j, sum_y[n] += i;
-          }
+// Paints the image of one camera. Holds that camera's buffers.
+class ScenePainter {
+ public:
+  // rays (H, W, 4): a lens' x/z, y/z and their change per pixel, whose samples are looked up in the plane; no rows for a pinhole.
+  ScenePainter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays)
+      : plane_(plane), rows_(plane_.height), columns_(plane_.width) {
+    if (rays.size() == 0) return;
+    rows_ = ptrdiff_t(rays.shape(0)), columns_ = ptrdiff_t(rays.shape(1));
+    rays_.resize(size_t(rows_ * columns_));
+    for (size_t i = 0; i < rays_.size(); ++i) std::copy_n(rays.data() + 4 * i, 4, rays_[i].begin());
+  }
+
+  // Adds an instant's weighted picture to the canvas, which is of the rays' size, or of the plane's. cam_from_map: rotation.
+  void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map, int samples,
+           std::tuple<double, double> shift, double weight, int most_taps, double reflectance, const Points& shadows, bool wants_truth,
+           const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m) {
+    if (samples < 1 || samples > 4) throw nb::value_error("samples: 1 to 4");
+    const auto is_picture = [&](const auto& array) { return array.shape(0) == size_t(rows_) && array.shape(1) == size_t(columns_); };
+    if (!is_picture(radiance) || !is_picture(depth_m)) throw nb::value_error("radiance, depth_m: of the picture's size");
+    const Textures textures = textures_of(atlas);
+    const Surfaces surfaces = surfaces_of(lit, chunks, int64_t(std::get<1>(atlas).shape(0)));
+    const auto [shift_x, shift_y] = shift;
+    const Instant instant{samples, shift_x, shift_y, weight, most_taps, reflectance, wants_truth, shadows.data(), shadows.shape(0)};
+    project(surfaces, cam_from_map, centre_map, false, direct_.polygons);
+    paint(direct_, samples, shift_x, shift_y, 0);
+    const ptrdiff_t first_row = first_floor_row(surfaces, samples);
+    mirrored_.polygons.clear();
+    if (reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
+    paint(mirrored_, 1, 0.0, 0.0, std::max<ptrdiff_t>(0, first_row - 6));  // all of one sample per pixel
+    shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data()});
+  }
+
+ private:
+  struct Polygon {  // of a visible face: (u', v', 1/z) = h (x/z, y/z, 1), u = u' z; its outline in pixels, clipped
+    double h[9], corners[8][2];
+    int corner_count;
+    int32_t face;
+  };
+  struct View {
+    std::vector<Polygon> polygons;
+    std::vector<float> nearness;  // 1/z and visible polygon of each sample
+    std::vector<int32_t> owner;
+  };
+
+  // The faces that may be seen; is_mirrored: of the world reflected in the floor, z -> -z.
+  void project(const Surfaces& surfaces, const Mat3& cam_from_map, Vec3 centre_map, bool is_mirrored,
+               std::vector<Polygon>& polygons) const {
+    const double sign_z = is_mirrored ? -1.0 : 1.0;
+    const Limits limits = {(-0.5 - plane_.cx) / plane_.fx, (double(plane_.width) - 0.5 - plane_.cx) / plane_.fx,
+                           (-0.5 - plane_.cy) / plane_.fy, (double(plane_.height) - 0.5 - plane_.cy) / plane_.fy};
+    polygons.clear();
+    for (size_t chunk = 0; chunk < surfaces.chunks; ++chunk) {
+      if (is_box_outside(surfaces.bounds + 6 * chunk, sign_z, cam_from_map, centre_map, limits)) continue;
+      for (int32_t f = surfaces.ranges[2 * chunk]; f < surfaces.ranges[2 * chunk + 1]; ++f) {
+        const double* quad = surfaces.quads + 9 * size_t(f);
+        const Vec3 origin = Vec3{quad[0], quad[1], sign_z * quad[2]} - centre_map;
+        const Vec3 u = {quad[3], quad[4], sign_z * quad[5]}, v = {quad[6], quad[7], sign_z * quad[8]};
+        // The outward normal against the direction to the face; a reflection turns the handedness.
+        if (dot(cross(v, u), origin) * sign_z >= -1e-9) continue;
+        const Vec3 a = cam_from_map * u, b = cam_from_map * v, c = cam_from_map * origin;
+        const Vec3 corners[4] = {c, c + a, c + a + b, c + b};
+        Outside outside;
+        for (const Vec3& corner : corners) outside.add(corner, limits);
+        if (outside.wholly()) continue;
+        // Rows of the inverse of the matrix [U V O] in camera axes, by cross products.
+        const Vec3 x = cross(b, c), y = cross(c, a), z = cross(a, b);
+        const double determinant = dot(a, x);
+        if (std::abs(determinant) < 1e-15) continue;
+        const double scale = 1.0 / determinant;
+        Polygon& polygon = polygons.emplace_back();
+        store(scale * x, polygon.h), store(scale * y, polygon.h + 3), store(scale * z, polygon.h + 6);
+        polygon.corner_count = clip_near(corners, outside.behind > 0, polygon);
+        polygon.face = f;
       }
-      double total = 0.0;
-      for (int n = 0; n < count; ++n) {
-        if (seen[n] < 0) continue;
-        const Polygon& polygon = direct_.polygons[size_t(seen[n])];
-        const double off_x = (sum_x[n] / hits[n] + 0.5) * step - 0.5, off_y = (sum_y[n] / hits[n] + 0.5) * step - 0.5;
-        double xn, yn;
-        if (rays_.empty()) {
-          xn = (double(x) + off_x + instant.shift_x - plane_.cx) * per_px_x;
-          yn = (double(y) + off_y + instant.shift_y - plane_.cy) * per_px_y;
-        } else {
-          const auto& ray = rays_[size_t(y * columns_ + x)];
-          per_px_x = ray[2], per_px_y = ray[3];
-          xn = ray[0] + off_x * per_px_x + instant.shift_x * wide_x;
-          yn = ray[1] + off_y * per_px_y + instant.shift_y * wide_y;
+    }
+  }
+
+  // Number of corners of the part of a quad in front of the near plane; fills the polygon's, in pixels.
+  int clip_near(const Vec3* corners, bool needs_clipping, Polygon& polygon) const {
+    const auto [fx, fy, cx, cy, width, height] = plane_;
+    if (!needs_clipping) {
+      for (int i = 0; i < 4; ++i) {
+        const double inverse = 1.0 / corners[i][2];
+        polygon.corners[i][0] = fx * corners[i][0] * inverse + cx, polygon.corners[i][1] = fy * corners[i][1] * inverse + cy;
+      }
+      return 4;
+    }
+    int count = 0;
+    const auto add = [&](double x, double y, double z) {
+      polygon.corners[count][0] = fx * x / z + cx, polygon.corners[count][1] = fy * y / z + cy;
+      ++count;
+    };
+    for (int i = 0; i < 4; ++i) {
+      const Vec3 from = corners[i], to = corners[(i + 1) & 3];
+      if (!(from[2] < kNearM)) add(from[0], from[1], from[2]);
+      if ((from[2] < kNearM) != (to[2] < kNearM)) {
+        const double share = (kNearM - from[2]) / (to[2] - from[2]);
+        add(from[0] + share * (to[0] - from[0]), from[1] + share * (to[1] - from[1]), kNearM);
+      }
+    }
+    return count;
+  }
+
+  // Paints the polygons, all convex, where they are nearest, from first_row on. Sample (i, j) lies at pixel
+  // ((j + 0.5) / samples - 0.5 + shift x, same for i and y). Ends are inclusive, so that neighbours leave no crack.
+  void paint(View& view, int samples, double shift_x, double shift_y, ptrdiff_t first_row) {
+    const ptrdiff_t height = plane_.height * samples, width = plane_.width * samples;
+    view.nearness.assign(size_t(height * width), 0.0f), view.owner.assign(size_t(height * width), -1);
+    low_.resize(size_t(height)), high_.resize(size_t(height));
+    double *const low = low_.data(), *const high = high_.data();
+    const double step = 1.0 / samples, start_x = 0.5 * step - 0.5 + shift_x, start_y = 0.5 * step - 0.5 + shift_y;
+    for (size_t k = 0; k < view.polygons.size(); ++k) {
+      const Polygon& polygon = view.polygons[k];
+      double y_min = kNever, y_max = -kNever;
+      for (int i = 0; i < polygon.corner_count; ++i) {
+        const double y = (polygon.corners[i][1] - start_y) * samples;
+        y_min = std::min(y_min, y), y_max = std::max(y_max, y);
+      }
+      const ptrdiff_t top = std::max(first_row, whole(std::ceil(std::max(y_min, -1.0))));
+      const ptrdiff_t bottom = std::min(height - 1, whole(std::floor(std::min(y_max, double(height) + 1.0))));
+      for (ptrdiff_t row = top; row <= bottom; ++row) low[row] = kNever, high[row] = -kNever;
+      for (int i = 0; top <= bottom && i < polygon.corner_count; ++i) {
+        const int j = i + 1 < polygon.corner_count ? i + 1 : 0;
+        double px = (polygon.corners[i][0] - start_x) * samples, py = (polygon.corners[i][1] - start_y) * samples;
+        double qx = (polygon.corners[j][0] - start_x) * samples, qy = (polygon.corners[j][1] - start_y) * samples;
+        if (py > qy) std::swap(px, qx), std::swap(py, qy);
+        const ptrdiff_t first = std::max(top, whole(std::ceil(std::max(py, -1.0))));
+        const ptrdiff_t last = std::min(bottom, whole(std::floor(std::min(qy, double(height) + 1.0))));
+        if (first > last) continue;
+        if (qy <= py) {  // a level edge on a row of samples
+          low[first] = std::min(std::min(low[first], px), qx), high[first] = std::max(std::max(high[first], px), qx);
+          continue;
         }
-        auto [value, u, v, w] = shade(surfaces, textures, polygon.h, polygon.face, xn, yn, per_px_x, per_px_y, instant.most_taps, 1.0);
-        if (surfaces.numbers[6 * size_t(polygon.face)] == kFloor) {
-          const double* quad = surfaces.quads + 9 * size_t(polygon.face);
-          const double x_map = quad[0] + u * quad[3], y_map = quad[1] + v * quad[7];
-          for (const double* shadow = instant.shadows; shadow < instant.shadows + 3 * instant.shadow_count; shadow += 3) {
-            const double dx = x_map - shadow[0], dy = y_map - shadow[1], inside = 1.0 - (dx * dx + dy * dy) * shadow[2];
-            if (inside > 0.0) value *= 1.0 - 0.55 * inside * inside;
+        const double slope = (qx - px) / (qy - py);
+        for (ptrdiff_t row = first; row <= last; ++row) {
+          const double x = px + (double(row) - py) * slope;
+          low[row] = std::min(low[row], x), high[row] = std::max(high[row], x);
+        }
+      }
+      const double* h = polygon.h + 6;
+      const double w_x = h[0] / plane_.fx * step, w_y = h[1] / plane_.fy * step;
+      double w_0 = h[2] + h[0] * (start_x - plane_.cx) / plane_.fx;
+      w_0 += h[1] * (start_y - plane_.cy) / plane_.fy;
+      for (ptrdiff_t row = top; row <= bottom; ++row) {
+        if (high[row] < -0.5 || low[row] > double(width)) continue;
+        const int32_t first = int32_t(std::max<ptrdiff_t>(0, whole(std::ceil(low[row]))));
+        const int32_t last = int32_t(std::min(width - 1, whole(std::floor(std::min(high[row], double(width) + 1.0)))) + 1);
+        const float start = float(w_0 + w_y * double(row)), slope = float(w_x);  // of 32 bits, so that the loop is one over wide registers
+        float* __restrict nearness = view.nearness.data() + row * width;
+        int32_t* __restrict owner = view.owner.data() + row * width;
+        const int32_t number = int32_t(k);
+        for (int32_t x = first; x < last; ++x) {
+          const float w = start + slope * float(x);
+          const bool is_nearer = w > nearness[x];
+          nearness[x] = is_nearer ? w : nearness[x];
+          owner[x] = is_nearer ? number : owner[x];
+        }
+      }
+    }
+  }
+
+  // First row of pixels of the plane that shows floor in any eighth pixel, its height without one.
+  ptrdiff_t first_floor_row(const Surfaces& surfaces, int samples) const {
+    for (ptrdiff_t row = 0; row < plane_.height; ++row)
+      for (ptrdiff_t x = 0; x < plane_.width; x += 8) {
+        const int32_t k = direct_.owner[size_t(row * samples * plane_.width * samples + x * samples)];
+        if (k >= 0 && surfaces.numbers[6 * size_t(direct_.polygons[size_t(k)].face)] == kFloor) return row;
+      }
+    return plane_.height;
+  }
+
+  // The owner of each sample of the picture (H S, W S): that of the plane, through the lens if there is one.
+  const int32_t* through_lens(int samples) {
+    if (rays_.empty()) return direct_.owner.data();
+    std::vector<int32_t>& indices = indices_[size_t(samples)];
+    const ptrdiff_t width = plane_.width * samples, height = plane_.height * samples;
+    if (indices.empty()) {
+      indices.reserve(size_t(rows_ * columns_ * samples * samples));
+      for (ptrdiff_t y = 0; y < rows_ * samples; ++y)
+        for (ptrdiff_t x = 0; x < columns_ * samples; ++x) {
+          const auto [xn, yn, per_px_x, per_px_y] = rays_[size_t(y / samples * columns_ + x / samples)];
+          const double off_x = (double(x % samples) + 0.5) / samples - 0.5, off_y = (double(y % samples) + 0.5) / samples - 0.5;
+          const double column = std::floor(((xn + off_x * per_px_x) * plane_.fx + plane_.cx + 0.5) * samples);
+          const double row = std::floor(((yn + off_y * per_px_y) * plane_.fy + plane_.cy + 0.5) * samples);
+          const bool is_inside = column >= 0.0 && column < double(width) && row >= 0.0 && row < double(height);
+          indices.push_back(is_inside ? int32_t(row) * int32_t(width) + int32_t(column) : -1);
+        }
+    }
+    seen_.resize(indices.size());
+    for (size_t i = 0; i < indices.size(); ++i) seen_[i] = indices[i] >= 0 ? direct_.owner[size_t(indices[i])] : -1;
+    return seen_.data();
+  }
+
+  // Samples of one polygon in a pixel are shaded once, at their mean place; owner: that of each sample.
+  void shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m, const Instant& instant,
+                   const Canvas& canvas) const {
+    const int samples = instant.samples;
+    const double wide_x = 1.0 / plane_.fx, wide_y = 1.0 / plane_.fy, step = 1.0 / samples;
+    double per_px_x = wide_x, per_px_y = wide_y;
+    for (ptrdiff_t y = 0; y < rows_; ++y)
+      for (ptrdiff_t x = 0; x < columns_; ++x) {
+        // The polygons of the pixel's samples: number of samples of each, and the sums of their positions.
+        int32_t seen[kMostSamples];
+        int hits[kMostSamples], count = 1;
+        double sum_x[kMostSamples], sum_y[kMostSamples];
+        const int32_t* const corner = owner + (y * columns_ * samples + x) * samples;
+        const auto at = [&](int i, int j) { return corner[i * columns_ * samples + j]; };
+        seen[0] = at(0, 0), hits[0] = samples * samples, sum_x[0] = sum_y[0] = 0.5 * (samples - 1) * hits[0];
+        bool is_uniform = true;
+        for (int i = 0; i < samples; ++i)
+          for (int j = 0; j < samples; ++j) is_uniform &= at(i, j) == seen[0];
+        if (!is_uniform) {
+          count = 0;
+          for (int i = 0; i < samples; ++i)
+            for (int j = 0; j < samples; ++j) {
+              int n = 0;
+              while (n < count && seen[n] != at(i, j)) ++n;
+              if (n == count) seen[n] = at(i, j), hits[n] = 0, sum_x[n] = sum_y[n] = 0.0, ++count;
+              ++hits[n], sum_x[n] += j, sum_y[n] += i;
+            }
+        }
+        double total = 0.0;
+        for (int n = 0; n < count; ++n) {
+          if (seen[n] < 0) continue;
+          const Polygon& polygon = direct_.polygons[size_t(seen[n])];
+          const double off_x = (sum_x[n] / hits[n] + 0.5) * step - 0.5, off_y = (sum_y[n] / hits[n] + 0.5) * step - 0.5;
+          double xn, yn;
+          if (rays_.empty()) {
+            xn = (double(x) + off_x + instant.shift_x - plane_.cx) * per_px_x;
+            yn = (double(y) + off_y + instant.shift_y - plane_.cy) * per_px_y;
+          } else {
+            const auto& ray = rays_[size_t(y * columns_ + x)];
+            per_px_x = ray[2], per_px_y = ray[3];
+            xn = ray[0] + off_x * per_px_x + instant.shift_x * wide_x;
+            yn = ray[1] + off_y * per_px_y + instant.shift_y * wide_y;
           }
-          if (instant.reflectance > 0.0 && std::abs(x_map) + std::abs(y_map) < kMostTexels) {
-            // Schlick's Fresnel term; the cosine of incidence is height over distance.
-            const double lack = 1.0 - std::min(height_m * w / std::sqrt(1.0 + xn * xn + yn * yn), 1.0);
-            const double fresnel = instant.reflectance + (1.0 - instant.reflectance) * lack * lack * lack * lack * lack;
-            // A wavy floor: the mirrored pixel moves by a slope read from the coarse tiling.
-            const uint8_t* waves = textures.texels + textures.table[textures.concrete * textures.columns + 2];
-            const double slope_x = bilinear(waves, 9, 9, x_map * 25.0, y_map * 25.0) - 128.0;
-            const double slope_y = bilinear(waves, 9, 9, y_map * 25.0 + 77.0, x_map * 25.0) - 128.0;
-            const double px = xn * plane_.fx + plane_.cx + 0.03 * slope_x, py = yn * plane_.fy + plane_.cy + 0.10 * slope_y;
-            const ptrdiff_t row = std::clamp<ptrdiff_t>(whole(std::floor(py + 0.5)), 0, plane_.height - 1);
-            const ptrdiff_t column = std::clamp<ptrdiff_t>(whole(std::floor(px + 0.5)), 0, plane_.width - 1);
-            const int32_t m = mirrored_.owner[size_t(row * plane_.width + column)];
-            if (m >= 0) {
-              const Polygon& mirrored = mirrored_.polygons[size_t(m)];
-              const double mx = (px - plane_.cx) * wide_x, my = (py - plane_.cy) * wide_y;
-              const Shade shown = shade(surfaces, textures, mirrored.h, mirrored.face, mx, my, per_px_x, per_px_y, 1, kGloss);
-              value += fresnel * 0.75 * std::min(shown.value, 4.0);
+          auto [value, u, v, w] = shade(surfaces, textures, polygon.h, polygon.face, xn, yn, per_px_x, per_px_y, instant.most_taps, 1.0);
+          if (surfaces.numbers[6 * size_t(polygon.face)] == kFloor) {
+            const double* quad = surfaces.quads + 9 * size_t(polygon.face);
+            const double x_map = quad[0] + u * quad[3], y_map = quad[1] + v * quad[7];
+            for (const double* shadow = instant.shadows; shadow < instant.shadows + 3 * instant.shadow_count; shadow += 3) {
+              const double dx = x_map - shadow[0], dy = y_map - shadow[1], inside = 1.0 - (dx * dx + dy * dy) * shadow[2];
+              if (inside > 0.0) value *= 1.0 - 0.55 * inside * inside;
+            }
+            if (instant.reflectance > 0.0 && std::abs(x_map) + std::abs(y_map) < kMostTexels) {
+              // Schlick's Fresnel term; the cosine of incidence is height over distance.
+              const double lack = 1.0 - std::min(height_m * w / std::sqrt(1.0 + xn * xn + yn * yn), 1.0);
+              const double fresnel = instant.reflectance + (1.0 - instant.reflectance) * lack * lack * lack * lack * lack;
+              // A wavy floor: the mirrored pixel moves by a slope read from the coarse tiling.
+              const uint8_t* waves = textures.texels + textures.table[textures.concrete * textures.columns + 2];
+              const double slope_x = bilinear(waves, 9, 9, x_map * 25.0, y_map * 25.0) - 128.0;
+              const double slope_y = bilinear(waves, 9, 9, y_map * 25.0 + 77.0, x_map * 25.0) - 128.0;
+              const double px = xn * plane_.fx + plane_.cx + 0.03 * slope_x, py = yn * plane_.fy + plane_.cy + 0.10 * slope_y;
+              const ptrdiff_t row = std::clamp<ptrdiff_t>(whole(std::floor(py + 0.5)), 0, plane_.height - 1);
+              const ptrdiff_t column = std::clamp<ptrdiff_t>(whole(std::floor(px + 0.5)), 0, plane_.width - 1);
+              const int32_t m = mirrored_.owner[size_t(row * plane_.width + column)];
+              if (m >= 0) {
+                const Polygon& mirrored = mirrored_.polygons[size_t(m)];
+                const double mx = (px - plane_.cx) * wide_x, my = (py - plane_.cy) * wide_y;
+                const Shade shown = shade(surfaces, textures, mirrored.h, mirrored.face, mx, my, per_px_x, per_px_y, 1, kGloss);
+                value += fresnel * 0.75 * std::min(shown.value, 4.0);
+              }
             }
           }
+          total += value * hits[n];
+          if (instant.wants_truth && n == 0) canvas.depth_m[y * columns_ + x] = float(1.0 / w);
         }
-        total += value * hits[n];
-        if (instant.wants_truth && n == 0) canvas.depth_m[y * columns_ + x] = float(1.0 / w);
+        if (instant.wants_truth && seen[0] < 0) canvas.depth_m[y * columns_ + x] = 0.0f;
+        canvas.radiance.row(y)[x] += instant.weight * total * step * step;
       }
-      if (instant.wants_truth && seen[0] < 0) canvas.depth_m[y * columns_ + x] = 0.0f;
-      canvas.radiance.row(y)[x] += instant.weight * total * step * step;
-    }
-}
+  }
 
-void ScenePainter::add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map,
-                       int samples, std::tuple<double, double> shift, double weight, int most_taps, double reflectance,
-                       const Points& shadows, bool wants_truth, const MutableArray<double, -1, -1>& radiance,
-                       const MutableArray<float, -1, -1>& depth_m) {
-  if (samples < 1 || samples > 4) throw nb::value_error("samples: 1 to 4");
-  const auto is_picture = [&](const auto& array) { return array.shape(0) == size_t(rows_) && array.shape(1) == size_t(columns_); };
-  if (!is_picture(radiance) || !is_picture(depth_m)) throw nb::value_error("radiance, depth_m: of the picture's size");
-  const Textures textures = textures_of(atlas);
-  const Surfaces surfaces = surfaces_of(lit, chunks, int64_t(std::get<1>(atlas).shape(0)));
-  const auto [shift_x, shift_y] = shift;
-  const Instant instant{samples, shift_x, shift_y, weight, most_taps, reflectance, wants_truth, shadows.data(), shadows.shape(0)};
-  project(surfaces, cam_from_map, centre_map, false, direct_.polygons);
-  paint(direct_, samples, shift_x, shift_y, 0);
-  const ptrdiff_t first_row = first_floor_row(surfaces, samples);
-  mirrored_.polygons.clear();
-  if (reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
-  paint(mirrored_, 1, 0.0, 0.0, std::max<ptrdiff_t>(0, first_row - 6));  // all of one sample per pixel
-  shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data()});
-}
+  Plane plane_;
+  std::vector<std::array<float, 4>> rays_;
+  ptrdiff_t rows_, columns_;  // of the picture
+  View direct_, mirrored_;
+  std::vector<double> low_, high_;               // ends of a polygon in each row
+  std::array<std::vector<int32_t>, 5> indices_;  // of each sample in the plane, -1 outside, by samples
+  std::vector<int32_t> seen_;
+};
 
 // An image (H, W) of gain * vignetting * radiance plus noise, clipped: shot noise of variance `shot` * value, read noise of this
 // standard deviation, from a table of standard normals, as long as a power of two, of which each row begins at a place mixed from key.

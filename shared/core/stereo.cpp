@@ -233,13 +233,12 @@ void match_depth(const Picture<const float>& disparity_px, const double* pixels,
 namespace {
 
 auto match_rows(const Image& left, const Image& right, const Image& left_half, const Image& right_half, const Places& pixels,
-                const Reals& prior_px, double max_disparity_px, double min_correlation, double uniqueness, int wide_half, int narrow_half,
-                double agreement_px) {
+                const Reals& prior_px, const nb::object& stereo, double max_disparity_px) {
   if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("right: of the left image's size");
   check_rows(pixels.shape(0), "prior_px: one for each pixel", prior_px);
   const size_t count = pixels.shape(0);
   std::vector<double> found(2 * count);
-  const StereoLimits limits = checked({max_disparity_px, min_correlation, uniqueness, wide_half, narrow_half, agreement_px});
+  const StereoLimits limits = stereo_limits({stereo}, max_disparity_px);
   unlocked([&] {
     StereoMatcher().match_rows({left, right}, {left_half, right_half}, pixels.data(), prior_px.data(), count, limits, found.data());
   });
@@ -256,8 +255,8 @@ auto match_depth_of(const Array<float, -1, -1>& disparity_px, const Places& pixe
 }  // namespace
 
 void bind_stereo(nb::module_& module) {
-  module.def("match_rows", &match_rows, "left"_a, "right"_a, "left_half"_a, "right_half"_a, "pixels"_a, "prior_px"_a, "max_disparity_px"_a,
-             "min_correlation"_a, "uniqueness"_a, "wide_half"_a, "narrow_half"_a, "agreement_px"_a);
+  module.def("match_rows", &match_rows, "left"_a, "right"_a, "left_half"_a, "right_half"_a, "pixels"_a, "prior_px"_a, "stereo"_a,
+             "max_disparity_px"_a);
   module.def("match_depth", &match_depth_of, "disparity_px"_a, "pixels"_a, "sigma_px"_a);
 }
 

@@ -94,7 +94,7 @@ bool fit_normal(const float* corner, ptrdiff_t row_step, int stride, ptrdiff_t r
   normal = {-a * lens.focal, -b * lens.focal, -(double(middle) - a * off_u - b * off_v)};
   const double length = norm(normal), towards = dot(normal, {off_u / lens.focal, off_v / lens.focal, 1.0});
   if (length <= 0.0 || towards >= 0.0) return false;
-  normal = {normal[0] / length, normal[1] / length, normal[2] / length};
+  normal = normal / length;
   return true;
 }
 
@@ -121,7 +121,7 @@ auto voxel_keys(const FloatPoints& points_map, const Levels& levels) {
   unlocked([&] {
     for (size_t i = 0; i < count; ++i) keys[i] = voxel_key(points_map(i, 0), points_map(i, 1), points_map(i, 2), levels(i));
   });
-  return as_numpy<int64_t>(std::move(keys));
+  return keys;
 }
 
 // Voxels of one recording, extended view by view.
@@ -130,16 +130,71 @@ class VoxelTable {
   // Adds the points of a view that lie in the box (2, 2) of the map, its low and its high (x, y). disparity: of every stride_px-th pixel,
   // NaN unknown, of standard deviation sigma_px. Points and normals are means by the inverse variance of the depth.
   void add(const Image32& disparity_px, double sigma_px, const StereoLens& lens, const SE3& map_from_cam,
-           const Array<double, 2, 2>& box_map);
+           const Array<double, 2, 2>& box_map) {
+    const Picture<const float> disparity = disparity_px;
+    const double *const low = &box_map(0, 0), *const high = &box_map(1, 0);
+    make_room(size_t(disparity.height) * size_t(disparity.width));
+    const int stride = stride_px(lens.focal);
+    const double per_m = edges_per_m(lens.focal);
+    const ptrdiff_t reach = std::clamp<ptrdiff_t>(kFitPx / stride, kLeastReach, kMostReach);
+    const ptrdiff_t row_step = disparity.width + kFitLanes;  // with unknown disparities all around
+    around_.assign(size_t((disparity.height + 2 * reach) * row_step + kFitLanes), std::numeric_limits<float>::quiet_NaN());
+    for (ptrdiff_t row = 0; row < disparity.height; ++row)
+      std::copy_n(disparity.row(row), disparity.width, around_.begin() + (row + reach) * row_step + reach);
+    for (ptrdiff_t row = 0; row < disparity.height; ++row)
+      for (ptrdiff_t column = 0; column < disparity.width; ++column) {
+        const float px = disparity.row(row)[column];
+        if (!(px > 0.0f)) continue;
+        const double z = lens.focal_baseline / px, sigma = z * z / lens.focal_baseline * sigma_px;
+        if (!(z >= kMinRangeM && z <= kMaxRangeM) || sigma > kMaxSigmaShare * z) continue;
+        const double u = double(column * stride), v = double(row * stride);
+        const Vec3 point = map_from_cam * Vec3{(u - lens.cx) * z / lens.focal, (v - lens.cy) * z / lens.focal, z};
+        if (!(point[0] >= low[0] && point[0] < high[0] && point[1] >= low[1] && point[1] < high[1])) continue;
+        Vec3 normal;
+        if (!fit_normal(around_.data() + row * row_step + column, row_step, stride, reach, u, v, lens, normal)) continue;
+        const int level = level_at(z, per_m);
+        const Vec3 turned = map_from_cam.rotation * normal;
+        const int64_t key = voxel_key(point[0], point[1], point[2], level);
+        int32_t& slot = slots_[slot_of(key)];
+        if (slot < 0) {
+          slot = int32_t(voxels_.size());
+          voxels_.push_back({key, 0.0f, {}, {}, -1, 0});
+        }
+        Voxel& voxel = voxels_[size_t(slot)];
+        const double edge = edge_of(level), weight = 1e-4 / (sigma * sigma);
+        voxel.weight = float(voxel.weight + weight);
+        for (int axis = 0; axis < 3; ++axis) {
+          voxel.offset[axis] = float(voxel.offset[axis] + weight * (point[axis] - std::floor(point[axis] / edge) * edge));
+          voxel.normal[axis] = float(voxel.normal[axis] + weight * turned[axis]);
+        }
+        if (voxel.last_view != views_) voxel.last_view = views_, ++voxel.views;
+      }
+    ++views_;
+  }
 
   using Triple = std::array<float, 3>;
   // Mean points in map, unit normals, levels, and numbers of views, of those voxels whose normals do not cancel out.
-  struct Surfels {
-    std::vector<Triple> points, normals;
-    std::vector<uint8_t> levels;
-    std::vector<int64_t> views;
-  };
-  Surfels surfels() const;
+  using Surfels = std::tuple<std::vector<Triple>, std::vector<Triple>, std::vector<uint8_t>, std::vector<int64_t>>;
+  Surfels surfels() const {
+    Surfels found;
+    auto& [points, normals, levels, views] = found;
+    const size_t most = voxels_.size();
+    points.reserve(most), normals.reserve(most), levels.reserve(most), views.reserve(most);
+    for (const Voxel& voxel : voxels_) {
+      const Vec3 normal = {voxel.normal[0], voxel.normal[1], voxel.normal[2]};
+      const double length = norm(normal);
+      if (!(length > 1e-9)) continue;
+      const int level = int(voxel.key >> 3 * kBits);
+      Triple &point = points.emplace_back(), &unit = normals.emplace_back();
+      for (int axis = 0; axis < 3; ++axis) {
+        const double cell = double(voxel.key >> kBits * (2 - axis) & ((1 << kBits) - 1)) - kHalfSpan;
+        point[size_t(axis)] = float(cell * edge_of(level) + double(voxel.offset[axis]) / double(voxel.weight));
+        unit[size_t(axis)] = float(normal[axis] / length);
+      }
+      levels.push_back(uint8_t(level)), views.push_back(voxel.views);
+    }
+    return found;
+  }
 
  private:
   struct Voxel {
@@ -147,8 +202,24 @@ class VoxelTable {
     float weight, offset[3], normal[3];  // sums; offsets are from the voxel's corner
     int32_t last_view, views;
   };
-  size_t slot_of(int64_t key) const;
-  void make_room(size_t more);
+
+  // Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4;
+  // the mixing of splitmix64.
+  size_t slot_of(int64_t key) const {
+    const uint64_t mask = slots_.size() - 1, mixed = uint64_t(key >> 3) * 0x9E3779B97F4A7C15;
+    uint64_t place = ((mixed ^ (mixed >> 29)) << 3 | uint64_t(key & 7)) & mask;
+    while (slots_[place] >= 0 && voxels_[size_t(slots_[place])].key != key) place = (place + 1) & mask;
+    return place;
+  }
+
+  void make_room(size_t more) {
+    const size_t needed = voxels_.size() + more;
+    size_t slots = std::max<size_t>(slots_.size(), 1 << 16);
+    while (slots < 2 * needed) slots *= 2;
+    if (slots == slots_.size()) return;
+    slots_.assign(slots, -1);
+    for (size_t i = 0; i < voxels_.size(); ++i) slots_[slot_of(voxels_[i].key)] = int32_t(i);
+  }
 
   std::vector<Voxel> voxels_;
   std::vector<int32_t> slots_;  // of a power of two, at most half of them taken: numbers of voxels, -1 none
@@ -156,127 +227,32 @@ class VoxelTable {
   std::vector<float> around_;  // of the view that is added
 };
 
-// Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4;
-// the mixing of splitmix64.
-size_t VoxelTable::slot_of(int64_t key) const {
-  const uint64_t mask = slots_.size() - 1, mixed = uint64_t(key >> 3) * 0x9E3779B97F4A7C15;
-  uint64_t place = ((mixed ^ (mixed >> 29)) << 3 | uint64_t(key & 7)) & mask;
-  while (slots_[place] >= 0 && voxels_[size_t(slots_[place])].key != key) place = (place + 1) & mask;
-  return place;
-}
-
-void VoxelTable::make_room(size_t more) {
-  const size_t needed = voxels_.size() + more;
-  size_t slots = std::max<size_t>(slots_.size(), 1 << 16);
-  while (slots < 2 * needed) slots *= 2;
-  if (slots == slots_.size()) return;
-  slots_.assign(slots, -1);
-  for (size_t i = 0; i < voxels_.size(); ++i) slots_[slot_of(voxels_[i].key)] = int32_t(i);
-}
-
-void VoxelTable::add(const Image32& disparity_px, double sigma_px, const StereoLens& lens, const SE3& map_from_cam,
-                     const Array<double, 2, 2>& box_map) {
-  const Picture<const float> disparity = disparity_px;
-  const double *const low = &box_map(0, 0), *const high = &box_map(1, 0);
-  make_room(size_t(disparity.height) * size_t(disparity.width));
-  const int stride = stride_px(lens.focal);
-  const double per_m = edges_per_m(lens.focal);
-  const ptrdiff_t reach = std::clamp<ptrdiff_t>(kFitPx / stride, kLeastReach, kMostReach);
-  const ptrdiff_t row_step = disparity.width + kFitLanes;  // with unknown disparities all around
-  around_.assign(size_t((disparity.height + 2 * reach) * row_step + kFitLanes), std::numeric_limits<float>::quiet_NaN());
-  for (ptrdiff_t row = 0; row < disparity.height; ++row)
-    std::copy_n(disparity.row(row), disparity.width, around_.begin() + (row + reach) * row_step + reach);
-  for (ptrdiff_t row = 0; row < disparity.height; ++row)
-    for (ptrdiff_t column = 0; column < disparity.width; ++column) {
-      const float px = disparity.row(row)[column];
-      if (!(px > 0.0f)) continue;
-      const double z = lens.focal_baseline / px, sigma = z * z / lens.focal_baseline * sigma_px;
-      if (!(z >= kMinRangeM && z <= kMaxRangeM) || sigma > kMaxSigmaShare * z) continue;
-      const double u = double(column * stride), v = double(row * stride);
-      const Vec3 point = map_from_cam * Vec3{(u - lens.cx) * z / lens.focal, (v - lens.cy) * z / lens.focal, z};
-      if (!(point[0] >= low[0] && point[0] < high[0] && point[1] >= low[1] && point[1] < high[1])) continue;
-      Vec3 normal;
-      if (!fit_normal(around_.data() + row * row_step + column, row_step, stride, reach, u, v, lens, normal)) continue;
-      const int level = level_at(z, per_m);
-      const Vec3 turned = map_from_cam.rotation * normal;
-      const int64_t key = voxel_key(point[0], point[1], point[2], level);
-      int32_t& slot = slots_[slot_of(key)];
-      if (slot < 0) {
-        slot = int32_t(voxels_.size());
-        voxels_.push_back({key, 0.0f, {}, {}, -1, 0});
-      }
-      Voxel& voxel = voxels_[size_t(slot)];
-      const double edge = edge_of(level), weight = 1e-4 / (sigma * sigma);
-      voxel.weight = float(voxel.weight + weight);
-      for (int axis = 0; axis < 3; ++axis) {
-        voxel.offset[axis] = float(voxel.offset[axis] + weight * (point[axis] - std::floor(point[axis] / edge) * edge));
-        voxel.normal[axis] = float(voxel.normal[axis] + weight * turned[axis]);
-      }
-      if (voxel.last_view != views_) voxel.last_view = views_, ++voxel.views;
-    }
-  ++views_;
-}
-
-VoxelTable::Surfels VoxelTable::surfels() const {
-  Surfels found;
-  const size_t most = voxels_.size();
-  found.points.reserve(most), found.normals.reserve(most), found.levels.reserve(most), found.views.reserve(most);
-  for (const Voxel& voxel : voxels_) {
-    const Vec3 normal = {voxel.normal[0], voxel.normal[1], voxel.normal[2]};
-    const double length = norm(normal);
-    if (!(length > 1e-9)) continue;
-    const int level = int(voxel.key >> 3 * kBits);
-    Triple &point = found.points.emplace_back(), &unit = found.normals.emplace_back();
-    for (int axis = 0; axis < 3; ++axis) {
-      const double cell = double(voxel.key >> kBits * (2 - axis) & ((1 << kBits) - 1)) - kHalfSpan;
-      point[size_t(axis)] = float(cell * edge_of(level) + double(voxel.offset[axis]) / double(voxel.weight));
-      unit[size_t(axis)] = float(normal[axis] / length);
-    }
-    found.levels.push_back(uint8_t(level)), found.views.push_back(voxel.views);
-  }
-  return found;
-}
-
-auto surfels_of(Shared<VoxelTable>& table) {
-  auto [points, normals, levels, views] = unlocked([&] { return table.surfels(); });
-  return std::tuple(as_numpy<float>(std::move(points)), as_numpy<float>(std::move(normals)), as_numpy<uint8_t>(std::move(levels)),
-                    as_numpy<int64_t>(std::move(views)));
-}
-
 enum Mark : uint8_t { kUnseen, kSeen, kSeenThrough };
 
-// Depths of a view. nearest_px: of every step_px-th pixel the largest disparity around it, 0 where its own is unknown. A point must lie
-// clear_sigmas standard deviations of the depth, and clear_m, before the pixel's depth to be seen through.
-struct DepthPicture {
-  Picture<const float> nearest_px;
-  double step_px, sigma_px;
-  StereoLens lens;
-  double clear_sigmas, clear_m;
-};
-
-DepthPicture depth_picture(const Image32& nearest_px, int step_px, double sigma_px, const StereoLens& lens, double clear_sigmas,
-                           double clear_m) {
-  if (step_px < 1) throw nb::value_error("step_px: at least 1");
-  return {nearest_px, double(step_px), sigma_px, lens, clear_sigmas, clear_m};
-}
+// Depths of a view: of every step_px-th pixel the largest disparity around it, 0 where its own is unknown, and the standard deviation of
+// disparities; the lens; cam_from_map. A point must lie clear_sigmas standard deviations of the depth, and clear_m, before the pixel's
+// depth to be seen through.
+using Depths = std::tuple<Image32, int, double, StereoLens, SE3, double, double>;
 
 struct Look {
   Mark mark = kUnseen;
   float weight = 0.0f;
   double u = 0.0, v = 0.0;
+  Vec3 point_cam = {};
 };
 
-Look look(Vec3 point_cam, int level, double per_m, const DepthPicture& view) {
+Look look(Vec3 point_map, int level, double per_m, const Depths& view) {
   Look found;
-  const StereoLens& lens = view.lens;
-  const double depth = point_cam[2];
+  const auto& [nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m] = view;
+  found.point_cam = cam_from_map * point_map;
+  const double depth = found.point_cam[2];
   if (!(depth > kMinRangeM && depth < kMaxRangeM)) return found;
-  found.u = lens.focal * point_cam[0] / depth + lens.cx, found.v = lens.focal * point_cam[1] / depth + lens.cy;
-  const ptrdiff_t column = whole(std::floor(found.u / view.step_px + 0.5)), row = whole(std::floor(found.v / view.step_px + 0.5));
-  const Picture<const float>& nearest = view.nearest_px;
+  found.u = lens.focal * found.point_cam[0] / depth + lens.cx, found.v = lens.focal * found.point_cam[1] / depth + lens.cy;
+  const ptrdiff_t column = whole(std::floor(found.u / step_px + 0.5)), row = whole(std::floor(found.v / step_px + 0.5));
+  const Picture<const float> nearest = nearest_px;
   if (column < 0 || column >= nearest.width || row < 0 || row >= nearest.height || !(nearest.row(row)[column] > 0.0f)) return found;
   const double shown = lens.focal_baseline / nearest.row(row)[column];
-  const double clear = view.clear_sigmas * shown * shown / lens.focal_baseline * view.sigma_px + view.clear_m;
+  const double clear = clear_sigmas * shown * shown / lens.focal_baseline * sigma_px + clear_m;
   found.weight = float(1 << 2 * std::max(0, level - level_at(depth, per_m)));
   if (depth < shown - clear)
     found.mark = kSeenThrough;
@@ -293,56 +269,45 @@ double bilinear(Picture<const uint8_t> picture, double u, double v) {
   return (upper[0] * (1.0 - x) + upper[1] * x) * (1.0 - y) + (lower[0] * (1.0 - x) + lower[1] * x) * y;
 }
 
+// Calls visit(i, look) for each point (N, 3) in map of a voxel of its level (N,).
+template <typename Visit>
+void for_each_look(const FloatPoints& points_map, const Levels& levels, const Depths& view, const Visit& visit) {
+  check_levels(levels, points_map.shape(0));
+  if (std::get<int>(view) < 1) throw nb::value_error("step_px: at least 1");
+  const nb::gil_scoped_release others_run;
+  const double per_m = edges_per_m(std::get<StereoLens>(view).focal);
+  for (size_t i = 0; i < levels.shape(0); ++i) visit(i, look(vec3(points_map.data() + 3 * i), levels.data()[i], per_m, view));
+}
+
 // Evidence of a view on points (N, 3) in map of voxels of these levels (N,): marks (N,), and pixels (N, 2) of points in range, else 0.
-auto look_at(const FloatPoints& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px,
-             const StereoLens& lens, const SE3& cam_from_map, double clear_sigmas, double clear_m) {
-  const size_t count = points_map.shape(0);
-  check_levels(levels, count);
-  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, clear_sigmas, clear_m);
-  auto marks = zeros<uint8_t>(count);
-  auto pixels = zeros<std::array<float, 2>>(count);
-  const float* const points = points_map.data();
-  const uint8_t* const level_of = levels.data();
-  unlocked([&] {
-    const SE3 pose = cam_from_map;
-    const double per_m = edges_per_m(lens.focal);
-    for (size_t i = 0; i < count; ++i) {
-      const Look found = look(pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, level_of[i], per_m, view);
-      marks[i] = found.mark, pixels[i] = {float(found.u), float(found.v)};
-    }
-  });
-  return std::tuple(as_numpy<uint8_t>(std::move(marks)), as_numpy<float>(std::move(pixels)));
+auto look_at(const FloatPoints& points_map, const Levels& levels, const Depths& view) {
+  auto marks = zeros<uint8_t>(points_map.shape(0));
+  auto pixels = zeros<std::array<float, 2>>(marks.size());
+  for_each_look(points_map, levels, view,
+                [&](size_t i, const Look& found) { marks[i] = found.mark, pixels[i] = {float(found.u), float(found.v)}; });
+  return std::tuple(std::move(marks), std::move(pixels));
 }
 
 // Adds what a view says of points, as of `look_at`, to sums (N, 4): 1 if it sees the point; its weight in views if it sees through it, as
 // a view that sees more finely than the voxel was seen counts more; and, of seen points, the grey level of the picture relative to the
 // exposure and to the lens, of these coefficients by powers of the squared tangent, over distance^4, and 1 over distance^4.
-void weigh(const FloatPoints& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px,
-           const StereoLens& lens, const SE3& cam_from_map, double clear_sigmas, double clear_m, const Image& picture, const Vec3& falloff,
+void weigh(const FloatPoints& points_map, const Levels& levels, const Depths& view, const Image& picture, const Vec3& falloff,
            double log_exposure, const MutableArray<double, -1, 4>& sums) {
-  const size_t count = points_map.shape(0);
-  check_levels(levels, count);
-  check_rows(count, "sums: a row for each point", sums);
-  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, clear_sigmas, clear_m);
+  check_rows(points_map.shape(0), "sums: a row for each point", sums);
   if (picture.shape(0) < 2 || picture.shape(1) < 2) return;
-  const nb::gil_scoped_release others_run;
-  const float* const points = points_map.data();
-  const uint8_t* const level_of = levels.data();
-  const SE3 pose = cam_from_map;
-  const double per_squared = 1.0 / (lens.focal * lens.focal), per_m = edges_per_m(lens.focal);
-  for (size_t i = 0; i < count; ++i) {
-    const Vec3 point = pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-    const Look found = look(point, level_of[i], per_m, view);
+  const StereoLens& lens = std::get<StereoLens>(view);
+  const double per_squared = 1.0 / (lens.focal * lens.focal);
+  for_each_look(points_map, levels, view, [&](size_t i, const Look& found) {
     double* const sum = &sums(i, 0);
     if (found.mark == kSeenThrough) sum[1] += found.weight;
-    if (found.mark != kSeen) continue;
+    if (found.mark != kSeen) return;
     sum[0] += 1.0;
     const double off_u = found.u - lens.cx, off_v = found.v - lens.cy, squared = (off_u * off_u + off_v * off_v) * per_squared;
     const double light = std::exp(log_exposure + squared * (falloff[0] + squared * (falloff[1] + squared * falloff[2])));
-    const double distance = dot(point, point), weight = 1.0 / (distance * distance);
+    const double distance = dot(found.point_cam, found.point_cam), weight = 1.0 / (distance * distance);
     sum[2] += bilinear(picture, found.u, found.v) / light * weight;
     sum[3] += weight;
-  }
+  });
 }
 
 // Of discs (N, 3) with normals (N, 3), in map, those that face the camera within a cone, of this cosine of the half angle and this length:
@@ -364,10 +329,10 @@ auto discs_before(const FloatPoints& points_map, const FloatPoints& normals_map,
     const double rim = kRim * width;
     numbers.reserve(count), points_cam.reserve(count), pixels.reserve(count);
     for (size_t i = 0; i < count; ++i) {
-      const Vec3 off = Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]} - centre;
+      const Vec3 off = vec3(points + 3 * i) - centre;
       const double squared = dot(off, off);
       if (squared > far_m * far_m || squared < 1e-4) continue;
-      if (dot({normals[3 * i], normals[3 * i + 1], normals[3 * i + 2]}, off) >= 0.0) continue;
+      if (dot(vec3(normals + 3 * i), off) >= 0.0) continue;
       const Vec3 point = rotation * off;
       const double depth = point[2];
       if (depth < cosine * std::sqrt(squared)) continue;
@@ -382,7 +347,7 @@ auto discs_before(const FloatPoints& points_map, const FloatPoints& normals_map,
       pixels.push_back({u, v});
     }
   });
-  return std::tuple(as_numpy<int32_t>(std::move(numbers)), as_numpy<double>(std::move(points_cam)), as_numpy<double>(std::move(pixels)));
+  return std::tuple(std::move(numbers), std::move(points_cam), std::move(pixels));
 }
 
 // Indices of points (M, 3) by bins of distance, near to far.
@@ -460,7 +425,7 @@ void draw(const Numbers& numbers_of, const Points& points, const Places& places,
         for (ptrdiff_t column = first_u / kBlockPx; column <= (last_u - 1) / kBlockPx; ++column)
           is_hidden &= least > hidden.row(row)[column];
       if (is_hidden) continue;
-      const Vec3 normal = rotation * Vec3{normals_map[3 * n], normals_map[3 * n + 1], normals_map[3 * n + 2]};
+      const Vec3 normal = rotation * vec3(normals_map + 3 * n);
       const double through = dot(normal, centre), per_squared = 1.0 / (radius * radius), factor = 1e-8 / (edge * edge * edge * edge);
       for (ptrdiff_t v = first_v; v < last_v; ++v)
         for (ptrdiff_t u = first_u; u < last_u; ++u) {
@@ -508,28 +473,23 @@ constexpr double kLeastAlpha = 1.0 / 255.0;  // smaller coverage of a pixel is n
 
 // Gaussians in a picture, front to back: pixels (M, 2) of their centres, conics (M, 3) xx, xy, yy of the inverse covariances,
 // reaches (M, 2) in px beyond which the least alpha is not reached, peaks (M,) of alpha and greys (M,).
-struct Gaussians {
-  const double *pixels, *conics, *reaches_px, *peaks, *greys;
-  size_t count;
+using Gaussians = std::tuple<Places, Points, Places, Reals, Reals>;
 
-  Gaussians(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys)
-      : pixels(pixels.data()),
-        conics(conics.data()),
-        reaches_px(reaches_px.data()),
-        peaks(peaks.data()),
-        greys(greys.data()),
-        count(pixels.shape(0)) {
-    check_rows(count, "conics, reaches_px, peaks, greys: one for each of pixels", conics, reaches_px, peaks, greys);
-  }
-};
+size_t checked(const Gaussians& gaussians) {
+  const size_t count = std::get<0>(gaussians).shape(0);
+  std::apply([&](const auto&... columns) { check_rows(count, "gaussians: columns of one length", columns...); }, gaussians);
+  return count;
+}
 
 // Calls visit(i, pixel's index, light before it, alpha, squared distance, (qu, qv) its derivatives) for each pixel of each Gaussian, and
 // takes the light; done(i) after each.
 template <typename Visit, typename Done>
-[[gnu::always_inline]] inline void for_each_pixel(const Gaussians& g, Picture<double> through, const Visit& visit, const Done& done) {
-  for (size_t i = 0; i < g.count; ++i) {
-    const double u_px = g.pixels[2 * i], v_px = g.pixels[2 * i + 1], reach_u = g.reaches_px[2 * i], reach_v = g.reaches_px[2 * i + 1];
-    const double xx = g.conics[3 * i], xy = g.conics[3 * i + 1], yy = g.conics[3 * i + 2];
+[[gnu::always_inline]] inline void for_each_pixel(const Gaussians& gaussians, Picture<double> through, const Visit& visit,
+                                                  const Done& done) {
+  const auto& [pixels, conics, reaches_px, peaks, greys] = gaussians;
+  for (size_t i = 0; i < peaks.shape(0); ++i) {
+    const double u_px = pixels(i, 0), v_px = pixels(i, 1), reach_u = reaches_px(i, 0), reach_v = reaches_px(i, 1);
+    const double xx = conics(i, 0), xy = conics(i, 1), yy = conics(i, 2), peak = peaks(i);
     const double first_u = std::max(0.0, std::ceil(u_px - reach_u)),
                  last_u = std::min(double(through.width) - 1.0, std::floor(u_px + reach_u));
     const double first_v = std::max(0.0, std::ceil(v_px - reach_v)),
@@ -542,7 +502,7 @@ template <typename Visit, typename Done>
           if (light < kHidden) continue;
           const double du = double(u) - u_px, dv = double(v) - v_px;
           const double qu = xx * du + xy * dv, qv = xy * du + yy * dv, squared = du * qu + dv * qv;
-          const double alpha = g.peaks[i] * std::exp(-0.5 * squared);
+          const double alpha = peak * std::exp(-0.5 * squared);
           if (alpha < kLeastAlpha) continue;
           visit(i, v * through.width + u, light, alpha, squared, qu, qv);
           passing = light * (1.0 - alpha);
@@ -552,17 +512,17 @@ template <typename Visit, typename Done>
 }
 
 // Blends Gaussians: the share of light that passes all (H, W), and the picture (H, W). Source: Kerbl et al. 2023.
-auto blend(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys, int width,
-           int height) {
+auto blend(const Gaussians& gaussians, int width, int height) {
   constexpr int64_t kMostPixels = 1 << 25;
-  const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
+  checked(gaussians);
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^25 pixels");
   const size_t rows = size_t(height), columns = size_t(width);
   std::vector<double> through, picture;
   unlocked([&] {
     through.assign(rows * columns, 1.0), picture.resize(rows * columns);
+    const double* const greys = std::get<4>(gaussians).data();
     const auto add = [&](size_t i, ptrdiff_t at, double light, double alpha, double, double, double) {
-      picture[size_t(at)] += light * alpha * gaussians.greys[i];
+      picture[size_t(at)] += light * alpha * greys[i];
     };
     for_each_pixel(gaussians, {through.data(), height, width}, add, [](size_t) {});
   });
@@ -572,19 +532,19 @@ auto blend(const Places& pixels, const Points& conics, const Places& reaches_px,
 // Gradients (M, 3) of a loss, whose slopes by the picture are (H, W), by grey, logarithm of the size and logit of the opacity
 // (M,). whole: the picture as `blend` made it. The pixels' own blur_px2 is on the diagonal of the covariances.
 // Source: Kerbl et al. 2023; Mip-Splatting, Yu et al. 2024.
-auto blend_backward(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys,
-                    const Reals& opacities, double blur_px2, const Image64& slopes, const Image64& whole) {
-  const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
-  check_rows(gaussians.count, "opacities: one for each of pixels", opacities);
+auto blend_backward(const Gaussians& gaussians, const Reals& opacities, double blur_px2, const Image64& slopes, const Image64& whole) {
+  const size_t count = checked(gaussians);
+  check_rows(count, "opacities: one for each of pixels", opacities);
   if (!same_size(slopes, whole)) throw nb::value_error("slopes: of the picture's size");
-  auto gradients = zeros<std::array<double, 3>>(gaussians.count);
+  auto gradients = zeros<std::array<double, 3>>(count);
   unlocked([&] {
     const double *const slope_of = slopes.data(), *const whole_of = whole.data();
+    const double *const greys = std::get<4>(gaussians).data(), *const conics = std::get<1>(gaussians).data();
     std::vector<double> through(whole.size(), 1.0), picture(whole.size());
     double by_grey = 0.0, by_size = 0.0, by_opacity = 0.0;
     const auto add = [&](size_t i, ptrdiff_t at, double light, double alpha, double squared, double qu, double qv) {
-      const double grey = gaussians.greys[i], slope = slope_of[at];
-      const double spread = blur_px2 * (gaussians.conics[3 * i] + gaussians.conics[3 * i + 2]);
+      const double grey = greys[i], slope = slope_of[at];
+      const double spread = blur_px2 * (conics[3 * i] + conics[3 * i + 2]);
       picture[size_t(at)] += light * alpha * grey;
       const double behind = whole_of[at] - picture[size_t(at)];
       const double by_alpha = slope * (light * grey - behind / (1.0 - alpha)) * alpha;
@@ -598,7 +558,7 @@ auto blend_backward(const Places& pixels, const Points& conics, const Places& re
     };
     for_each_pixel(gaussians, {through.data(), ptrdiff_t(whole.shape(0)), ptrdiff_t(whole.shape(1))}, add, keep);
   });
-  return as_numpy<double>(std::move(gradients));
+  return gradients;
 }
 
 }  // namespace
@@ -613,18 +573,15 @@ void bind_surfels(nb::module_& module) {
   nb::class_<Shared<VoxelTable>>(module, "VoxelTable")
       .def(nb::init<>())
       .def("add", in_turn<PythonLock::kReleased>(&VoxelTable::add), "disparity_px"_a, "sigma_px"_a, "lens"_a, "map_from_cam"_a, "box_map"_a)
-      .def("surfels", in_turn(&surfels_of));
-  module.def("look_at", &look_at, "points_map"_a, "levels"_a, "nearest_px"_a, "step_px"_a, "sigma_px"_a, "lens"_a, "cam_from_map"_a,
-             "clear_sigmas"_a, "clear_m"_a);
-  module.def("weigh", &weigh, "points_map"_a, "levels"_a, "nearest_px"_a, "step_px"_a, "sigma_px"_a, "lens"_a, "cam_from_map"_a,
-             "clear_sigmas"_a, "clear_m"_a, "picture"_a, "falloff"_a, "log_exposure"_a, "sums"_a);
+      .def("surfels", in_turn<PythonLock::kReleased>(&VoxelTable::surfels));
+  module.def("look_at", &look_at, "points_map"_a, "levels"_a, "view"_a);
+  module.def("weigh", &weigh, "points_map"_a, "levels"_a, "view"_a, "picture"_a, "falloff"_a, "log_exposure"_a, "sums"_a);
   module.def("discs_before", &discs_before, "points_map"_a, "normals_map"_a, "cam_from_map"_a, "cosine"_a, "far_m"_a, "pinhole"_a,
              "width"_a, "height"_a);
   module.def("draw_discs", &draw_discs, "numbers"_a, "points_cam"_a, "pixels"_a, "cam_from_map"_a, "normals_map"_a, "levels"_a, "colours"_a,
              "far_m"_a, "radius_edges"_a, "rays"_a, "pixels_per_rad"_a);
-  module.def("blend", &blend, "pixels"_a, "conics"_a, "reaches_px"_a, "peaks"_a, "greys"_a, "width"_a, "height"_a);
-  module.def("blend_backward", &blend_backward, "pixels"_a, "conics"_a, "reaches_px"_a, "peaks"_a, "greys"_a, "opacities"_a, "blur_px2"_a,
-             "slopes"_a, "whole"_a);
+  module.def("blend", &blend, "gaussians"_a, "width"_a, "height"_a);
+  module.def("blend_backward", &blend_backward, "gaussians"_a, "opacities"_a, "blur_px2"_a, "slopes"_a, "whole"_a);
 }
 
 }  // namespace fleetmap

@@ -38,7 +38,7 @@ auto descend(const Packed& packed, const Packed& packed_centres, const Numbers& 
       words[i] = word_of[node];
     }
   });
-  return as_numpy<int32_t>(std::move(words));
+  return words;
 }
 
 using Weights = Array<float, -1>;
@@ -82,19 +82,14 @@ class InvertedFile {
   int32_t places_ = 0;
 };
 
-using SharedFile = Shared<InvertedFile>;
-
 }  // namespace
 
 void bind_vocabulary(nb::module_& module) {
   module.def("descend", &descend, "descriptors"_a, "centres"_a, "first_child"_a, "child_count"_a, "word_of_node"_a);
-  nb::class_<SharedFile>(module, "InvertedFile")
+  nb::class_<Shared<InvertedFile>>(module, "InvertedFile")
       .def(nb::init<int>(), "words"_a)
       .def("add", in_turn<PythonLock::kReleased>(&InvertedFile::add), "word_ids"_a, "weights"_a)
-      .def("scores", in_turn(+[](SharedFile& index, const Numbers& words, const Weights& of_words) {
-             return as_numpy<double>(unlocked([&] { return index.scores(words, of_words); }));
-           }),
-           "word_ids"_a, "weights"_a);
+      .def("scores", in_turn<PythonLock::kReleased>(&InvertedFile::scores), "word_ids"_a, "weights"_a);
 }
 
 }  // namespace fleetmap

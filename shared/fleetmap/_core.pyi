@@ -22,6 +22,10 @@ _Octaves = NDArray[np.int8]
 # Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), True if the disparities are measured.
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
+# Of a view: nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m.
+_Depths = tuple[_Floats, int, float, _Reals, _Reals, float, float]
+# Pixels (M, 2), conics (M, 3), reaches_px (M, 2), peaks (M,), greys (M,).
+_Gaussians = tuple[_Reals, _Reals, _Reals, _Reals, _Reals]
 _Counts = NDArray[np.uint16]
 _Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
 
@@ -251,7 +255,8 @@ def register_depth(
     radial-tangential, whose image folds back at x^2 + y^2 = `reach`; or 4, equidistant.
     """
 
-def spare_keyframes(
+def redundant_keyframes(
+    order: _Indices,
     rows: _Indices,
     row_starts: _Indices,
     tracks: _Indices,
@@ -263,10 +268,10 @@ def spare_keyframes(
     share: float,
     least: int,
 ) -> _Flags:
-    """(K,) keyframes of whose tracks a share, and at least `least`, are seen on other visits; visits are `gap` keyframes apart.
+    """(K,) keyframes, checked in `order`, of whose tracks a share, and at least `least`, are seen on other visits.
 
-    Members (M,) of tracks by ascending keyframe: tracks, keyframes, octaves; starts (G + 1,) delimits each track's, row_starts (K + 1,)
-    each keyframe's in rows (M,).
+    Visits are more than `gap` keyframes apart. Members (M,) of tracks, by ascending keyframe unless gap is 0: tracks, keyframes,
+    octaves; starts (G + 1,) delimits each track's, row_starts (K + 1,) each keyframe's in rows (M,).
     """
 
 def duplicate_landmarks(
@@ -281,22 +286,6 @@ def duplicate_landmarks(
     """(N,) the less observed landmark of every near pair (P, 2), in order, whose two could be one landmark.
 
     starts (N + 1,) delimits each landmark's obs_keyframe (M,); descriptors of their first observations.
-    """
-
-def redundant_keyframes(
-    order: _Indices,
-    rows: _Indices,
-    row_starts: _Indices,
-    obs_landmark: _Numbers,
-    obs_keyframe: _Numbers,
-    octaves: _Indices,
-    starts: _Indices,
-    observers: int,
-    share: float,
-) -> _Flags:
-    """(K,) keyframes, checked in `order`, of whose observations a share is repeated by enough remaining keyframes.
-
-    row_starts (K + 1,) delimits each keyframe's observations in rows, starts (N + 1,) each landmark's.
     """
 
 def medoids(descriptors: _Descriptors, starts: _Indices) -> _Indices:
@@ -355,12 +344,8 @@ def match_rows(
     right_half: _Grey,
     pixels: _Reals,
     prior_px: _Reals,
+    stereo: object,
     max_disparity_px: float,
-    min_correlation: float,
-    uniqueness: float,
-    wide_half: int,
-    narrow_half: int,
-    agreement_px: float,
 ) -> _Reals:
     """(N, 2) disparity and standard deviation of left pixels (N, 2), NaN where unknown; prior_px (N,) NaN for none."""
 
@@ -411,29 +396,13 @@ class VoxelTable:
     def surfels(self) -> tuple[_Floats, _Floats, _Grey, _Indices]:
         """Points, normals and levels of the voxels, and the number of views of each."""
 
-def look_at(
-    points_map: _Floats,
-    levels: _Grey,
-    nearest_px: _Floats,
-    step_px: int,
-    sigma_px: float,
-    lens: _Reals,
-    cam_from_map: _Reals,
-    clear_sigmas: float,
-    clear_m: float,
-) -> tuple[_Grey, _Pixels]:
+def look_at(points_map: _Floats, levels: _Grey, view: _Depths) -> tuple[_Grey, _Pixels]:
     """Marks (N,), 1 seen, 2 seen through, 0 neither; pixels of the points."""
 
 def weigh(
     points_map: _Floats,
     levels: _Grey,
-    nearest_px: _Floats,
-    step_px: int,
-    sigma_px: float,
-    lens: _Reals,
-    cam_from_map: _Reals,
-    clear_sigmas: float,
-    clear_m: float,
+    view: _Depths,
     picture: _Grey,
     falloff: _Reals,
     log_exposure: float,
@@ -471,22 +440,10 @@ def draw_discs(
 ) -> tuple[_Floats, _Floats, _Floats]:
     """Weight, and colour and depth along the ray times it, of each pixel (H, W)."""
 
-def blend(
-    pixels: _Reals, conics: _Reals, reaches_px: _Reals, peaks: _Reals, greys: _Reals, width: int, height: int
-) -> tuple[_Reals, _Reals]:
+def blend(gaussians: _Gaussians, width: int, height: int) -> tuple[_Reals, _Reals]:
     """Share of light that passes all Gaussians, and their image (H, W)."""
 
-def blend_backward(
-    pixels: _Reals,
-    conics: _Reals,
-    reaches_px: _Reals,
-    peaks: _Reals,
-    greys: _Reals,
-    opacities: _Reals,
-    blur_px2: float,
-    slopes: _Reals,
-    whole: _Reals,
-) -> _Reals:
+def blend_backward(gaussians: _Gaussians, opacities: _Reals, blur_px2: float, slopes: _Reals, whole: _Reals) -> _Reals:
     """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""
 
 def allocations() -> int:

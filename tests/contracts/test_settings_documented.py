@@ -59,9 +59,10 @@ def test_tiers_name_settings_that_exist(program: str) -> None:
 def test_every_setting_is_read_somewhere() -> None:
     """A setting that nothing reads promises something that does not happen."""
     files = [path for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))]
-    files += sorted((REPOSITORY / "shared/core/bindings").glob("*.cpp"))  # which take a section as an object
     source = "\n".join(path.read_text("utf-8") for path in files)
+    core = "\n".join(path.read_text("utf-8") for path in (REPOSITORY / "shared/core").rglob("*.[ch]*"))
     read = {*re.findall(r"\.(\w+)", source), *re.findall(r"[\"'](\w+)(?=[\"'])", source)}
+    read |= {*re.findall(r'\["(\w+)"\]', core)}  # which takes a section as an object
     unread = [
         f"{name}.{field.name}"
         for name, kind in _sections().items()

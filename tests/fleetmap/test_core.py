@@ -51,6 +51,8 @@ DTYPES = {
     "_Octaves": "int8",
     "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
+    "_Depths": "tuple[dtype=float32, int, float, dtype=float64, dtype=float64, float, float]",
+    "_Gaussians": "tuple[dtype=float64, dtype=float64, dtype=float64, dtype=float64, dtype=float64]",
     "_Counts": "uint16",
     "_Rows": "collections.abc.Callable",
 }
@@ -116,7 +118,6 @@ UNLIT = np.ones((0, 5)), 1.0, True, np.zeros((1, 4), np.float32)
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PLACES = np.zeros((20, 30), np.uint8), np.full((4, 2), 9.0)
 BOX, SAMPLES, ZERO, ONES = np.ones((1, 8)), np.zeros((3, 3)), np.zeros(3), np.ones(3)
-STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
 REFINEMENT = 4.0, 11.0, (10, 5)
 
 
@@ -155,9 +156,9 @@ def test_a_depth_image_of_strange_numbers_gives_values(strange: float, lens: Arr
 
 # Calls with places (4, 2) of any numbers, at which they read a noisy image; test_core_hostile.py seldom finds images that go together.
 HOSTILE = {
-    "match_rows": lambda places: core.match_rows(*[NOISE] * 4, places, places[:, 0].copy(), *STEREO_LIMITS),
+    "match_rows": lambda places: core.match_rows(*[NOISE] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0),
     "match_rows, without a limit": lambda places: core.match_rows(
-        *[NOISE] * 4, places, places[:, 1].copy(), 8.0, -np.inf, np.inf, 7, 7, np.inf
+        *[NOISE] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0
     ),
     "follow_pixels": lambda places: core.follow_pixels(
         NOISE, NOISE[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
@@ -165,6 +166,9 @@ HOSTILE = {
     "tracker": lambda places: tracked(np.column_stack([places, places[::-1, 0]])),
 }
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
+ANY_MATCH = StereoSettings(
+    min_correlation=-np.inf, uniqueness=np.inf, wide_half_px=7, narrow_half_px=7, agreement_px=np.inf
+)
 ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18, 1e308, 29.999999999999996, -1e-300]))
 
 

@@ -119,10 +119,10 @@ def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_
     reaches_px = np.ascontiguousarray(reaches_px[is_seen])
     gaussians = pixels[is_seen], np.ascontiguousarray(conics), reaches_px, peaks[is_seen], chosen[is_seen, GREY]
     numbers, opacities = numbers[is_seen], opacities[is_seen]
-    through, picture = core.blend(*gaussians, camera.width_px, camera.height_px)
+    through, picture = core.blend(gaussians, camera.width_px, camera.height_px)
 
     def backward(slopes: Array) -> tuple[NDArray[np.int64], Array]:
-        return numbers, core.blend_backward(*gaussians, opacities, BLUR_PX2, np.ascontiguousarray(slopes), picture)
+        return numbers, core.blend_backward(gaussians, opacities, BLUR_PX2, np.ascontiguousarray(slopes), picture)
 
     return Drawn(picture, through, backward)
 

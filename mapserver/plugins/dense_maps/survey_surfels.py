@@ -118,7 +118,7 @@ class SurfelGrower:
         last = np.array([self._camera.width_px, self._camera.height_px]) - 1
         for rows in blocks:
             for number in images.seeing(points_map[rows]):
-                marks, pixels = core.look_at(points_map[rows], levels[rows], *images.depths(number))
+                marks, pixels = core.look_at(points_map[rows], levels[rows], images.depths(number))
                 seen = np.flatnonzero(marks == _SEEN)
                 column, row = np.clip(pixels[seen].round().astype(np.int64), 0, last).T
                 greys = self._looks[number].picture[row, column].astype(np.float64)
@@ -168,7 +168,7 @@ class SurfelGrower:
             points_map, levels = surfels.points_map[rows], surfels.levels[rows]
             for number in images.seeing(points_map):
                 light = self._looks[number].picture, exposure.falloff, float(exposure.logs[number])
-                core.weigh(points_map, levels, *(*images.depths(number), *light, sums[rows]))
+                core.weigh(points_map, levels, images.depths(number), *light, sums[rows])
         return sums
 
     def _brightness_shift(self, tiles: Sequence[tuple[Surfels, Surfels]]) -> float:

@@ -115,7 +115,7 @@ def cull(
     sigmas_m (N,) of the landmarks.
     """
     marks = state.landmarks
-    octaves = marks.of_features([k.features.octaves for k in keyframes]).astype(np.int64)
+    octaves = marks.of_features([k.features.octaves for k in keyframes])
     double = _duplicates(marks, keyframes, sigmas_m, settings)
     weak = ~double & (parallax_rad(state) < np.radians(settings.min_parallax_deg))
     lasting = ~(double | weak)
@@ -154,7 +154,7 @@ def _duplicates(
 
 
 def redundant(
-    marks: Landmarks, octaves: NDArray[np.int64], lasting: NDArray[np.bool_], count: int, settings: CullSettings
+    marks: Landmarks, octaves: NDArray[np.int8], lasting: NDArray[np.bool_], count: int, settings: CullSettings
 ) -> NDArray[np.bool_]:
     """Return (count,) keyframes whose landmarks are to a `redundant_share` seen by three others at the same or a finer scale.
 
@@ -166,7 +166,6 @@ def redundant(
     seen = np.bincount(own, minlength=count)
     order = np.array(sorted(range(1, count - 1), key=lambda k: (seen[k], k)), np.int64)
     rows, row_starts = usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)])
-    observed = marks.obs_landmark, marks.obs_keyframe, octaves, marks.starts
-    return core.redundant_keyframes(
-        order, rows, row_starts, *observed, settings.redundant_observers, settings.redundant_share
-    )
+    observed = marks.obs_landmark.astype(np.int64), marks.starts, marks.obs_keyframe.astype(np.int64), octaves
+    limits = settings.redundant_observers, settings.redundant_share
+    return core.redundant_keyframes(order, rows, row_starts, *observed, 0, *limits, 0)

@@ -36,7 +36,8 @@ def redundant_keyframes(tracks: Tracks, posed: RigImages, settings: SurveySettin
     gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
     members = track, starts, owners, octaves
     limits = gap, cull.repeated_visits, cull.repeated_share, least
-    redundant = core.spare_keyframes(order, row_starts, *members, *limits)
+    last_first = np.arange(len(posed.numbers) - 1, 0, -1)
+    redundant = core.redundant_keyframes(last_first, order, row_starts, *members, *limits)
     while (alone := _left_alone(owners, track, redundant, least)).any():
         redundant |= alone
     return redundant

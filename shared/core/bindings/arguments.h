@@ -13,17 +13,14 @@ inline fleetmap::Clearance clearance(const std::optional<Image>& px) {
   return {*px};
 }
 
-inline fleetmap::StereoLimits checked(const fleetmap::StereoLimits& limits) {
-  if (!(limits.max_disparity_px >= 0.0 && limits.max_disparity_px <= 1e5)) throw nb::value_error("max_disparity_px: 0 to 100,000");
-  for (const int half : {limits.wide_half, limits.narrow_half})
-    if (half < 1 || half > fleetmap::kMostStereoHalf) throw nb::value_error("wide_half, narrow_half: 1 to 7");
-  return limits;
-}
-
 // Those of StereoSettings.
 inline fleetmap::StereoLimits stereo_limits(const Settings& stereo, double max_disparity_px) {
-  return checked({max_disparity_px, stereo["min_correlation"], stereo["uniqueness"], stereo["wide_half_px"], stereo["narrow_half_px"],
-                  stereo["agreement_px"]});
+  const fleetmap::StereoLimits limits{max_disparity_px,       stereo["min_correlation"], stereo["uniqueness"],
+                                      stereo["wide_half_px"], stereo["narrow_half_px"],  stereo["agreement_px"]};
+  if (!(max_disparity_px >= 0.0 && max_disparity_px <= 1e5)) throw nb::value_error("max_disparity_px: 0 to 100,000");
+  for (const int half : {limits.wide_half, limits.narrow_half})
+    if (half < 1 || half > fleetmap::kMostStereoHalf) throw nb::value_error("wide_half_px, narrow_half_px: 1 to 7");
+  return limits;
 }
 
 // What a grid of corners' distances may hold.
@@ -48,7 +45,6 @@ inline fleetmap::Refinement refinement_of(const Limits& limits) {
 
 inline fleetmap::ImuSamples imu_samples(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2) {
   const size_t count = stamps_ns.shape(0);
-  if (gyro_radps.shape(0) != count || accel_mps2.shape(0) != count)
-    throw nb::value_error("gyro_radps, accel_mps2: a row for each of stamps_ns");
+  check_rows(count, "gyro_radps, accel_mps2: a row for each of stamps_ns", gyro_radps, accel_mps2);
   return {stamps_ns.data(), gyro_radps.data(), accel_mps2.data(), count};
 }

@@ -33,6 +33,11 @@ struct View : nb::ndarray<T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu
   {
     return {this->data(), this->shape(0)};
   }
+  const fleetmap::Vec3* rows() const
+    requires std::is_same_v<T, const double>
+  {
+    return reinterpret_cast<const fleetmap::Vec3*>(this->data());
+  }
   T* begin() const { return this->data(); }
   T* end() const { return this->data() + this->size(); }
 };
@@ -50,7 +55,17 @@ using Indices = Array<int64_t, -1>;
 using Numbers = Array<int32_t, -1>;
 using Flags = MutableArray<bool, -1>;
 
-// A numpy array that owns the vector's numbers. Element: what the vector's hold, such as float for pixels.
+// What values consist of.
+template <typename T>
+struct NumberOf {
+  using Type = T;
+};
+template <typename T, size_t kCount>
+struct NumberOf<std::array<T, kCount>> : NumberOf<T> {};
+template <>
+struct NumberOf<fleetmap::Vec3> : NumberOf<double> {};
+
+// A numpy array that owns the vector's numbers. Element: what the vector's hold.
 template <typename Element, int kDimensions, typename T>
 nb::ndarray<nb::numpy, Element, nb::ndim<kDimensions>> as_numpy(std::vector<T>&& values, std::initializer_list<size_t> shape) {
   auto* kept = new std::vector<T>(std::move(values));
@@ -117,7 +132,20 @@ struct type_caster<fleetmap::Mat3> : copied_caster<fleetmap::Mat3, fleetmap::mat
 template <>
 struct type_caster<fleetmap::SE3> : copied_caster<fleetmap::SE3, fleetmap::se3, 4, 4> {};
 template <>
+struct type_caster<fleetmap::Mat6> : copied_caster<fleetmap::Mat6, fleetmap::mat6, 6, 6> {};
+template <>
 struct type_caster<fleetmap::StereoLens> : copied_caster<fleetmap::StereoLens, fleetmap::stereo_lens, 4> {};
+
+// A vector becomes an array, with a row for each of its values.
+template <typename T>
+  requires std::is_trivially_copyable_v<T>
+struct type_caster<std::vector<T>> {
+  using Made = decltype(as_numpy<typename NumberOf<T>::Type>(std::vector<T>()));
+  NB_TYPE_CASTER(std::vector<T>, make_caster<Made>::Name)
+  static handle from_cpp(std::vector<T> values, rv_policy, cleanup_list* cleanup) noexcept {
+    return make_caster<Made>::from_cpp(as_numpy<typename NumberOf<T>::Type>(std::move(values)), rv_policy::automatic, cleanup);
+  }
+};
 
 }  // namespace nanobind::detail
 

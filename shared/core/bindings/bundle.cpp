@@ -19,12 +19,6 @@ void check(bool holds, const char* message) {
 
 std::vector<double> numbers(const double* from, size_t count) { return {from, from + count}; }
 
-std::vector<Vec3> points_of(const Points& points) {
-  std::vector<Vec3> out;
-  for (size_t n = 0; n < points.shape(0); ++n) out.push_back(vec3(&points(n, 0)));
-  return out;
-}
-
 // What moves where the calibration does: theta, its weight, the ways of the relative poses, which of theta is their scale, and the rows.
 using Calibration = std::tuple<Reals, Reals, Points, size_t, nb::callable>;
 template <int64_t... kShape>
@@ -44,12 +38,8 @@ auto motions_of(const BundleState& state) {
   return as_numpy<double, 2>(unlocked([&] { return state.motions; }), {count, count ? state.motions.size() / count : 0});
 }
 
-auto points_of(const BundleState& state) {
-  return as_numpy<double>(unlocked([&] { return state.points; }));
-}
-
-auto calibration_of(const BundleState& state) {
-  return as_numpy<double>(unlocked([&] { return state.calibration; }));
+std::vector<Vec3> points_of(const BundleState& state) {
+  return unlocked([&] { return state.points; });
 }
 
 // What Python owns, for whoever does not hold its lock.
@@ -65,7 +55,7 @@ std::shared_ptr<const T> kept(const T& value) {
 ImageRows rows_at(const nb::callable& said, const BundleState& state, bool derivatives, size_t observations) {
   const nb::gil_scoped_acquire held;
   Rows rows;
-  const nb::object answer = said(poses_of(state), motions_of(state), points_of(state), calibration_of(state), derivatives);
+  const nb::object answer = said(poses_of(state), motions_of(state), points_of(state), state.calibration, derivatives);
   check(nb::try_cast(answer, rows), "rows: residuals, derivatives by point and calibration, and positions");
   const auto& [residuals, by_point, by_calibration, positions] = rows;
   const size_t derived = derivatives ? observations : 0;
@@ -124,7 +114,7 @@ void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cam
   problem.points_held = points_held;
   problem.observations.reserve(observations);
   for (size_t n = 0; n < observations; ++n) {
-    const Vec3 pixels = vec3(&obs_pixels(n, 0));
+    const Vec3 pixels = obs_pixels.rows()[n];
     problem.observations.push_back({obs_keyframe(n), obs_camera(n), obs_landmark(n), pixels, {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
   }
   for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
@@ -141,7 +131,7 @@ void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cam
   problem.gravity = gravity;
   problem.motion_mean = numbers(motion_mean.data(), motion_mean.size());
   problem.motion_weight = numbers(motion_weight.data(), motion_weight.size());
-  BundleState start = {{}, numbers(motions.data(), motions.size()), points_of(points_map), {}};
+  BundleState start = {{}, numbers(motions.data(), motions.size()), {points_map.rows(), points_map.rows() + landmarks}, {}};
   for (size_t k = 0; k < keyframes; ++k) start.map_from_body.push_back(se3(&map_from_body(k, 0, 0)));
   if (calibration) {
     const auto& [theta, weight, ways, scale, said] = *calibration;
@@ -152,14 +142,9 @@ void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cam
     problem.calibration_weight = numbers(weight.data(), weight.size());
     problem.scale = scale;
     problem.rows = std::move(rows);
-    for (size_t n = 0; n < ways.shape(0); ++n) problem.relatives[n].way = vec3(&ways(n, 0));
+    for (size_t n = 0; n < ways.shape(0); ++n) problem.relatives[n].way = ways.rows()[n];
   }
   new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff);
-}
-
-auto nodes_of(const BundleSolver& solver) {
-  auto [sizes, pairs] = unlocked([&] { return std::pair(solver.node_sizes(), solver.node_pairs()); });
-  return std::tuple(as_numpy<int64_t>(std::move(sizes)), as_numpy<int64_t>(std::move(pairs)));
 }
 
 size_t factorise_sparsely(BundleSolver& solver, const Indices& order) {
@@ -179,20 +164,20 @@ auto optimize(BundleSolver& solver, double lambda_start, int max_iterations, dou
     if (PyErr_CheckSignals() != 0) throw nb::python_error();
   };
   auto outcome = unlocked([&] { return solver.optimize({lambda_start, relative_cost_tolerance, max_iterations}, interruptible); });
-  return std::tuple(as_numpy<double>(std::move(outcome.costs)), outcome.iterations, outcome.converged);
+  return std::tuple(std::move(outcome.costs), outcome.iterations, outcome.converged);
 }
 
 auto reduced(BundleSolver& solver, double damping) {
   std::vector<double> lower, b;
   unlocked([&] { solver.reduced(damping, lower, b); });
   const size_t count = b.size();
-  return std::tuple(as_numpy<double, 2>(std::move(lower), {count, count}), as_numpy<double>(std::move(b)));
+  return std::tuple(as_numpy<double, 2>(std::move(lower), {count, count}), std::move(b));
 }
 
-auto step_of(BundleSolver& solver, double damping) {
+std::optional<std::vector<double>> step_of(BundleSolver& solver, double damping) {
   std::vector<double> step;
-  const bool is_solved = unlocked([&] { return solver.solve(damping, step); });
-  return is_solved ? std::optional(as_numpy<double>(std::move(step))) : std::nullopt;
+  if (unlocked([&] { return solver.solve(damping, step); })) return step;
+  return {};
 }
 
 auto inertial_residual(const Array<double, 2, 4, 4>& map_from_body, const Array<double, 2, 9>& motions, const Vec3& gravity,
@@ -213,7 +198,8 @@ void bind_bundle(nb::module_& module) {
            "relative_information"_a, "prior_keyframe"_a, "prior_map_from_body"_a, "prior_information"_a, "edge_ends"_a, "increments"_a,
            "edge_information"_a, "motion_mean"_a, "motion_weight"_a, "gravity"_a, "huber"_a, "cutoff"_a, "calibration"_a = nb::none())
       .def_prop_ro("unknowns", &BundleSolver::unknowns)
-      .def("nodes", &nodes_of)
+      .def("nodes",
+           [](const BundleSolver& solver) { return unlocked([&] { return std::tuple(solver.node_sizes(), solver.node_pairs()); }); })
       .def("factorise_sparsely", &factorise_sparsely, "order"_a)
       .def("cost", [](BundleSolver& solver) { return unlocked([&] { return solver.cost(); }); })
       .def("optimize", &optimize, "lambda_start"_a, "max_iterations"_a, "relative_cost_tolerance"_a)
@@ -223,9 +209,8 @@ void bind_bundle(nb::module_& module) {
       .def("map_from_body", [](const BundleSolver& solver) { return poses_of(solver.state()); })
       .def("motions", [](const BundleSolver& solver) { return motions_of(solver.state()); })
       .def("points_map", [](const BundleSolver& solver) { return points_of(solver.state()); })
-      .def("calibration", [](const BundleSolver& solver) { return calibration_of(solver.state()); })
-      .def("squared_sigmas",
-           [](const BundleSolver& solver) { return as_numpy<double>(unlocked([&] { return solver.squared_sigmas(); })); });
+      .def("calibration", [](const BundleSolver& solver) { return unlocked([&] { return solver.state().calibration; }); })
+      .def("squared_sigmas", [](const BundleSolver& solver) { return unlocked([&] { return solver.squared_sigmas(); }); });
   module.def("inertial_residual", &inertial_residual, "map_from_body"_a, "motions"_a, "gravity"_a, "increments"_a);
 }
 

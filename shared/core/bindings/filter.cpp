@@ -1,7 +1,5 @@
 #include "arguments.h"  // first: Python's header comes before the system's
 
-#include <nanobind/stl/vector.h>
-
 #include <algorithm>
 #include <cmath>
 #include <string>
@@ -14,24 +12,9 @@ namespace {
 
 using Transforms = Array<double, -1, 4, 4>;
 using Lenses = Array<double, -1, 4>;
-using Covariance = Array<double, 6, 6>;
 using Noise = std::tuple<double, double, double, double>;
 
 using SharedFilter = Shared<Filter>;
-
-constexpr size_t kMostClones = 1000;
-
-size_t index_of(const Filter& filter, int64_t clone_id) {
-  const std::vector<int64_t>& ids = filter.clone_ids();
-  const auto found = std::find(ids.begin(), ids.end(), clone_id);
-  if (found == ids.end()) throw nb::value_error("clone_id: of a clone that is held");
-  return size_t(found - ids.begin());
-}
-
-size_t newest(const Filter& filter) {
-  if (filter.clone_ids().empty()) throw nb::value_error("a clone is needed");
-  return filter.clone_ids().size() - 1;
-}
 
 // Cameras, each of a lens and a pose.
 template <typename Camera>
@@ -81,29 +64,6 @@ Vec3 predict_inertial(SharedFilter& filter, const Indices& stamps_ns, const Poin
   });
 }
 
-void predict_random_walk(SharedFilter& filter, const SE3& body_from_next, double rotation_sigma_rad, double translation_sigma_m,
-                         double duration_s, const std::optional<Covariance>& measured_cov) {
-  const CountedStep counted;
-  filter.predict_random_walk(body_from_next, rotation_sigma_rad, translation_sigma_m, duration_s,
-                             measured_cov ? measured_cov->data() : nullptr);
-}
-
-void add_clone(SharedFilter& filter, int64_t clone_id, const Vec3& rate_body_radps) {
-  if (filter.clone_ids().size() == kMostClones) throw nb::value_error("clone_id: at most 1000 clones are held");
-  const CountedStep counted;
-  filter.add_clone(clone_id, rate_body_radps);
-}
-
-void remove_clone(SharedFilter& filter, int64_t clone_id) {
-  const CountedStep counted;
-  filter.remove_clone(index_of(filter, clone_id));
-}
-
-SE3 begin_frame_anew(SharedFilter& filter) {
-  newest(filter);
-  return {kIdentity, -unlocked([&] { return filter.begin_frame_anew(); })};
-}
-
 void observe(SharedFilter& filter, int64_t frame_index, int64_t camera, const Indices& ids, const Points& pixels) {
   const size_t cameras = filter.cameras().size();
   if (size_t(camera) >= cameras)
@@ -124,23 +84,10 @@ auto update(SharedFilter& filter, const Indices& alive, const Array<bool, -1>& d
   return as_numpy<int8_t>(std::vector(*used));
 }
 
-auto motion_since(SharedFilter& filter, int64_t clone_id) {
-  const size_t index = index_of(filter, clone_id);
-  double covariance[36];
-  filter.motion_covariance(index, covariance);
-  return std::tuple(filter.motion_between(index, newest(filter)), copied<2>(covariance, {6, 6}));
-}
-
-SE3 cam_from_earlier(SharedFilter& filter, int64_t clone_id, const SE3& cam_from_body, size_t camera) {
-  if (camera >= filter.cameras().size()) throw nb::value_error("camera: its number");
-  const SE3 body_from_earlier = inverse(filter.state.body()) * filter.clone(index_of(filter, clone_id));
-  return cam_from_body * body_from_earlier * filter.cameras()[camera].body_from_cam;
-}
-
-auto body_covariance(SharedFilter& filter) {
-  double covariance[36];
-  filter.body_covariance(covariance);
-  return copied<2>(covariance, {6, 6});
+nb::list clone_ids(SharedFilter& filter) {
+  nb::list ids;
+  for (const int64_t id : filter.clone_ids()) ids.append(id);
+  return ids;
 }
 
 auto nav_state(SharedFilter& filter) {
@@ -185,14 +132,15 @@ auto linearise_track_of(const Vec3& point, const Transforms& odom_from_cam, cons
 // map_from_next and its covariance (6, 6): rotation first, in map axes, about the body, rotation on the left and position shifted
 // independently of each other, SO(3) x R^3, as the given one; cov_step (6, 6) is a left perturbation of the step in the body's axes about
 // the body. Source: Barfoot and Furgale 2014.
-auto compose_pose(const SE3& map_from_body, const Covariance& covariance, const SE3& body_from_next, const Covariance& cov_step) {
-  double turn[36]{}, lever[36]{}, total[36], composed[36];
+std::tuple<SE3, Mat6> compose_pose(const SE3& map_from_body, const Mat6& covariance, const SE3& body_from_next, const Mat6& cov_step) {
+  double turn[36]{}, lever[36]{}, total[36];
   for (const int corner : {0, 21}) store(map_from_body.rotation, turn + corner, 6), store(kIdentity, lever + corner, 6);
   store(-1.0 * skew(map_from_body.rotation * body_from_next.translation), lever + 18, 6);
-  carry<6, 6>(turn, cov_step.data(), total);
-  for (int k = 0; k < 36; ++k) total[k] = covariance.data()[k] + total[k];
-  carry<6, 6>(lever, total, composed);
-  return std::tuple(map_from_body * body_from_next, copied<2>(composed, {6, 6}));
+  carry<6, 6>(turn, cov_step.at, total);
+  for (int k = 0; k < 36; ++k) total[k] = covariance.at[k] + total[k];
+  Mat6 composed;
+  carry<6, 6>(lever, total, composed.at);
+  return {map_from_body * body_from_next, composed};
 }
 
 }  // namespace
@@ -204,13 +152,12 @@ void bind_filter(nb::module_& module) {
            "nav_true_error"_a, "lenses"_a, "body_from_cams"_a, "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
       .def("predict_inertial", in_turn(&predict_inertial), "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "start_ns"_a, "end_ns"_a,
            "noise"_a, "true_noise"_a)
-      .def("predict_random_walk", in_turn(&predict_random_walk), "body_from_next"_a, "rotation_sigma_rad"_a, "translation_sigma_m"_a,
-           "duration_s"_a = 0.0, "measured_cov"_a = nb::none())
-      .def("add_clone", in_turn(&add_clone), "clone_id"_a, "rate_body_radps"_a)
-      .def("remove_clone", in_turn(&remove_clone), "clone_id"_a)
-      .def("return_to_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }),
-           "clone_id"_a)
-      .def("begin_frame_anew", in_turn(&begin_frame_anew))
+      .def("predict_random_walk", in_turn(&Filter::predict_random_walk), "body_from_next"_a, "rotation_sigma_rad"_a,
+           "translation_sigma_m"_a, "duration_s"_a = 0.0, "measured_cov"_a = nb::none())
+      .def("add_clone", in_turn(&Filter::add_clone), "clone_id"_a, "rate_body_radps"_a)
+      .def("remove_clone", in_turn(&Filter::remove_clone), "clone_id"_a)
+      .def("return_to_clone", in_turn(&Filter::return_to_clone), "clone_id"_a)
+      .def("begin_frame_anew", in_turn<kReleased>(&Filter::begin_frame_anew))
       .def("observe", in_turn(&observe), "frame_index"_a, "camera"_a, "ids"_a, "pixels"_a)
       .def("update", in_turn(&update), "alive"_a, "due"_a, "first_depth_m"_a, "iterations"_a = 1, "newest_odom_from_body"_a = nb::none(),
            "sigma_scale"_a = 1.0)
@@ -218,22 +165,16 @@ void bind_filter(nb::module_& module) {
            "sigma_radps"_a, "gyro_radps"_a, "base_from_body"_a, "gate"_a)
       .def("correct_by_rest", in_turn<kReleased>(&Filter::correct_by_rest), "gyro_mean_radps"_a, "gyro_sigma_radps"_a, "gate"_a)
       .def("correct_by_speed", in_turn(&Filter::correct_by_speed), "velocity_odom_mps"_a, "sigma_mps"_a)
-      .def("inflate", in_turn(+[](SharedFilter& filter, int64_t id, const SE3& seen, double gap_s) {
-             return filter.inflate(index_of(filter, id), seen.translation, gap_s);
-           }),
-           "clone_id"_a, "seen_odom_from_body"_a, "gap_s"_a)
+      .def("inflate", in_turn(&Filter::inflate), "clone_id"_a, "seen_odom_from_body"_a, "gap_s"_a)
       .def("inflate_velocity", in_turn(&Filter::inflate_velocity), "sigma_mps"_a)
-      .def("motion_between", in_turn(+[](SharedFilter& filter, int64_t earlier, int64_t later) {
-             return filter.motion_between(index_of(filter, earlier), index_of(filter, later));
-           }),
-           "earlier_id"_a, "later_id"_a)
-      .def("motion_since", in_turn(&motion_since), "clone_id"_a)
-      .def("cam_from_earlier", in_turn(&cam_from_earlier), "clone_id"_a, "cam_from_body"_a, "camera"_a = 0)
-      .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return filter.clone(index_of(filter, id)); }), "clone_id"_a)
+      .def("motion_between", in_turn(&Filter::motion_between), "earlier_id"_a, "later_id"_a)
+      .def("motion_since", in_turn(&Filter::motion_since), "clone_id"_a)
+      .def("cam_from_earlier", in_turn(&Filter::cam_from_earlier), "clone_id"_a, "cam_from_body"_a, "camera"_a = 0)
+      .def("odom_from_clone", in_turn(&Filter::clone), "clone_id"_a)
       .def("odom_from_body", in_turn(+[](SharedFilter& filter) { return filter.state.body(); }))
-      .def("body_covariance", in_turn(&body_covariance))
+      .def("body_covariance", in_turn(&Filter::body_covariance))
       .def("nav_state", in_turn(&nav_state))
-      .def_prop_ro("clone_ids", in_turn(+[](SharedFilter& filter) { return filter.clone_ids(); }))
+      .def_prop_ro("clone_ids", in_turn(&clone_ids))
       .def_prop_ro("covariance", in_turn(+[](SharedFilter& filter) { return matrix(filter.covariance); }), nb::rv_policy::automatic)
       .def_prop_ro("true_error_cov", in_turn(+[](SharedFilter& filter) { return matrix(filter.true_error_cov); }), nb::rv_policy::automatic)
       .def_prop_ro("offset_sigma_s", in_turn(+[](SharedFilter& filter) {

@@ -30,8 +30,8 @@ auto in_turn(Result (*function)(Object&, Arguments...)) {
 
 // The same of a method that needs no Python; a short one keeps the lock.
 enum class PythonLock { kKept, kReleased };
-template <PythonLock kLock = PythonLock::kKept, typename Object, typename Result, typename... Arguments>
-auto in_turn(Result (Object::*method)(Arguments...)) {
+template <PythonLock kLock, typename Object, typename Result, typename... Arguments, typename Method>
+auto method_in_turn(Method method) {
   return [method](Shared<Object>& object, Arguments... arguments) -> Result {
     const Turn turn(object.busy);
     const auto call = [&] { return (object.*method)(std::forward<Arguments>(arguments)...); };
@@ -39,4 +39,12 @@ auto in_turn(Result (Object::*method)(Arguments...)) {
     const fleetmap::CountedStep counted;
     return call();
   };
+}
+template <PythonLock kLock = PythonLock::kKept, typename Object, typename Result, typename... Arguments>
+auto in_turn(Result (Object::*method)(Arguments...)) {
+  return method_in_turn<kLock, Object, std::decay_t<Result>, Arguments...>(method);
+}
+template <PythonLock kLock = PythonLock::kKept, typename Object, typename Result, typename... Arguments>
+auto in_turn(Result (Object::*method)(Arguments...) const) {
+  return method_in_turn<kLock, Object, std::decay_t<Result>, Arguments...>(method);
 }

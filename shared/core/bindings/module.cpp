@@ -5,7 +5,19 @@
 #include <cpuid.h>
 #endif
 
+#include <cstdlib>
+#include <new>
+
 #include "allocations.h"
+
+// In place of the library's, for this module.
+void* operator new(size_t size) {
+  ++fleetmap::all_allocations;
+  if (void* const memory = std::malloc(size > 0 ? size : 1)) return memory;
+  throw std::bad_alloc();
+}
+void operator delete(void* memory) noexcept { std::free(memory); }
+void operator delete(void* memory, size_t) noexcept { std::free(memory); }
 
 namespace nb = nanobind;
 
@@ -38,7 +50,7 @@ NB_MODULE(_core, module) {
         "is not; in a virtual machine let it see the host's processor");
 #endif
   using namespace fleetmap;
-  module.def("allocations", &step_allocations);
+  module.def("allocations", [] { return step_allocations; });
   for (Bind* const bind : {bind_aliases,       bind_bundle,     bind_camera,         bind_corners,    bind_filter,      bind_grid,
                            bind_image_quality, bind_imu_checks, bind_landmarks,      bind_matching,   bind_mono_window, bind_pair_matching,
                            bind_patch_align,   bind_pnp,        bind_preintegration, bind_projection, bind_rays,        bind_relocalization,

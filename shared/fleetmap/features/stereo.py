@@ -26,9 +26,7 @@ def disparities(
     # whole images are only searched at half size
     halves = (frame.left, frame.right) if np.isfinite(prior).all() else (frame.half_left, frame.half_right)
     sought = np.ascontiguousarray(pixels, np.float64), prior
-    scores, windows = (settings.min_correlation, settings.uniqueness), (settings.wide_half_px, settings.narrow_half_px)
-    images = frame.left, frame.right
-    matched = core.match_rows(*images, *halves, *sought, max_disparity, *scores, *windows, settings.agreement_px)
+    matched = core.match_rows(frame.left, frame.right, *halves, *sought, settings, max_disparity)
     matched[~(matched[:, 0] > settings.min_disparity_px)] = np.nan
     return matched
 

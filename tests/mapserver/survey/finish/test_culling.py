@@ -22,15 +22,15 @@ def test_keyframes_that_repeat_each_other_do_not_all_go() -> None:
     """Eight keyframes see the same forty landmarks: each goes while three others see them, so three stay, the ends among them."""
     table = np.array([(n, k) for n in range(40) for k in range(8)])
     lasting = np.ones(40, bool)
-    gone = redundant(seen_by(table, 40), np.zeros(len(table), np.int64), lasting, 8, CullSettings())
+    gone = redundant(seen_by(table, 40), np.zeros(len(table), np.int8), lasting, 8, CullSettings())
     assert gone.sum() == 5
     assert not gone[[0, 7]].any()
     # Keyframe 3 sees at octave 0 what the others see at octave 4: from farther, or as larger corners.
-    finer = redundant(seen_by(table, 40), np.where(table[:, 1] == 3, 0, 4), lasting, 8, CullSettings())
+    finer = redundant(seen_by(table, 40), np.where(table[:, 1] == 3, 0, 4).astype(np.int8), lasting, 8, CullSettings())
     assert not finer[3]
     assert finer.sum() >= 3
     few = np.array([(n, k) for n in range(40) for k in sorted({n % 8, (n + 1) % 8})])
-    assert not redundant(seen_by(few, 40), np.zeros(len(few), np.int64), lasting, 8, CullSettings()).any()
+    assert not redundant(seen_by(few, 40), np.zeros(len(few), np.int8), lasting, 8, CullSettings()).any()
 
 
 def test_a_double_goes_and_its_neighbours_stay() -> None:
