@@ -93,8 +93,11 @@ Figure = tuple[str, float, dict[str, str]]
 """Name, value and labels of a metric."""
 
 
-class Metrics:
-    """Counters of one server, in a registry of their own."""
+class Metrics(Collector):
+    """Counters of one server, in a registry of their own, and what it reads of sites, robots and fleet sums at each scrape.
+
+    The store deletes old data; Prometheus treats the decrease as a restart.
+    """
 
     def __init__(
         self,
@@ -103,6 +106,7 @@ class Metrics:
         alerts: AlertSettings = _USUAL_ALERTS,
         certificate: HttpCertificate | None = None,
     ) -> None:
+        self._store, self._fleet, self._alerts, self._certificate = store, fleet, alerts, certificate
         own = self._registry = CollectorRegistry()
         ProcessCollector(registry=own)
         labels = ["method", "route", "status"]
@@ -113,7 +117,7 @@ class Metrics:
         self._bus_messages = Counter(name, words, ["what", "result"], registry=own)
         name, words = "fleetmap_bus_sent_bytes_total", "Bytes sent in answers."
         self._bus_bytes = Counter(name, words, ["what"], registry=own)
-        own.register(_FleetCollector(store, fleet, alerts, certificate))
+        own.register(self)
 
     def count_http(self, method: str, route: str, status: int, seconds_s: float) -> None:
         """Count one HTTP request; `route` is the template, not the path, so paths cannot create new series."""
@@ -126,18 +130,6 @@ class Metrics:
 
     def text(self) -> bytes:
         return generate_latest(self._registry)
-
-
-class _FleetCollector(Collector):
-    """Reads sites, robots and fleet sums at each scrape.
-
-    The store deletes old data; Prometheus treats the decrease as a restart.
-    """
-
-    def __init__(
-        self, store: MapStore, fleet: Fleet, alerts: AlertSettings, certificate: HttpCertificate | None
-    ) -> None:
-        self._store, self._fleet, self._alerts, self._certificate = store, fleet, alerts, certificate
 
     def collect(self) -> list[Metric]:
         """All metrics of the tables, also those without a figure."""

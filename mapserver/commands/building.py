@@ -16,7 +16,6 @@ from mapserver.commands.options import (
     StoreFolder,
     check_output,
     open_store,
-    print_json,
     print_result,
 )
 
@@ -196,7 +195,7 @@ def set_(
         keep = partial(keep_rmf_building, levels=levels) if levels else keep_building
         kept = keep(maps, building, actor=by.named())
         lifts = single_lifts(floors_of(maps, kept))
-        _print(maps, kept)
+        print_result(kept, _building_words(maps, kept))
     if lifts:
         words = "areas with the same `lift` on the other floors are missing"
         typer.echo(f"note: {', '.join(lifts)}: {words}", err=True)
@@ -227,15 +226,11 @@ def list_buildings(
 
     with open_store(store, read_only=True) as maps:
         found = buildings(maps)
-        if json:
-            print_json(found)
-            return
-        if form == "rmf":
+        if form == "rmf" and not json:
             typer.echo("---\n".join(rmf_text(building, floors_of(maps, building)) for building in found), nl=False)
             return
-        for building in found:
-            _print(maps, building)
-    typer.echo(f"buildings: {len(found)}")
+        lines = [line for building in found for line in _building_words(maps, building)]
+    print_result(found, [*lines, f"buildings: {len(found)}"], json=json)
 
 
 def _entry(text: str, levels: "Mapping[str, RmfLevel]") -> "FloorEntry":
@@ -260,15 +255,15 @@ def _entry(text: str, levels: "Mapping[str, RmfLevel]") -> "FloorEntry":
     return FloorEntry(site=check_name(site, "site"), level=level, height_m=height_m)
 
 
-def _print(maps: "MapStore", building: "Building") -> None:
+def _building_words(maps: "MapStore", building: "Building") -> Iterator[str]:
     from mapserver.fleet.building import floors_of
 
     lifts = {floor.entry.site: ", ".join(sorted(floor.lifts)) for floor in floors_of(maps, building)}
-    typer.echo(f"{building.name}:")
+    yield f"{building.name}:"
     for floor in reversed(building.floors):
         known = lifts.get(floor.site)
         words = "not aligned" if known is None else f"lifts: {known or 'none'}"
-        typer.echo(f"  {floor.level}  {floor.site}  {floor.height_m:g} m  {words}")
+        yield f"  {floor.level}  {floor.site}  {floor.height_m:g} m  {words}"
 
 
 BUILDING = Group(

@@ -15,6 +15,9 @@ from fleetmap.errors import UsageError, disk_errors
 from fleetmap.log_lines import printable
 
 if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
     from fleetmap.recordings import Topics
     from mapserver import BuildOptions
     from mapserver.store import Actor, MapStore
@@ -136,32 +139,28 @@ def print_json(value: object) -> None:
     typer.echo(to_json(value, indent=2).decode())
 
 
-def print_result(value: object, lines: Iterable[str], *, json: bool) -> None:
-    """Print the result of a command to stdout: a value as JSON, or else its lines."""
+def print_result(value: object, parts: "Iterable[str | Table | Text]", *, json: bool = False) -> None:
+    """Print the result of a command to stdout: a value as JSON, or else its lines and tables."""
+    from fleetmap.console import plain_console
+
     if json:
         print_json(value)
         return
-    for line in lines:
-        typer.echo("\n".join(map(printable, line.split("\n"))))  # strangers chose some of the words
+    for part in parts:
+        if isinstance(part, str):
+            typer.echo("\n".join(map(printable, part.split("\n"))))  # strangers chose some of the words
+        else:
+            plain_console().print(part)
 
 
-def print_table(columns: Sequence[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
-    """Print rows to stdout; the cell of None is empty."""
+def table(columns: Sequence[str], rows: Iterable[Iterable[object]], title: str | None = None) -> "Table":
+    """Return a table of rows to print; the cell of None is empty."""
     from rich.table import Table
 
-    from fleetmap.console import plain_console
-
-    table = Table(*columns, title=title)
+    made = Table(*columns, title=title)
     for row in rows:
-        table.add_row(*("" if cell is None else printable(str(cell)) for cell in row))
-    plain_console().print(table)
-
-
-def print_records(
-    columns: Sequence[str], found: Sequence[object], rows: Iterable[Iterable[object]], *, json: bool
-) -> None:
-    """Print records to stdout: as JSON, or else their rows."""
-    print_json(found) if json else print_table(columns, rows)
+        made.add_row(*("" if cell is None else printable(str(cell)) for cell in row))
+    return made
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, Group, settings_of
 from mapserver.api.operations.incidents import InboxFolder
-from mapserver.commands.options import Json, StoreFolder, open_store, print_records
+from mapserver.commands.options import Json, StoreFolder, open_store, print_result, table
 
 Site = Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")]
 
@@ -20,7 +20,7 @@ def list_robots(store: StoreFolder, site: Site = None, json: Json = False) -> No
         found = [entry.shown(maps.now_ns()) for entry in RobotRegister(maps).robots(site)]
     enrolled = [f"{datetime.fromtimestamp(row.enrolled_ns / 1e9, UTC):%Y-%m-%d %H:%M}" for row in found]
     rows = ((r.site, r.robot, r.certificate, at, r.state) for r, at in zip(found, enrolled, strict=True))
-    print_records(("site", "robot", "certificate", "enrolled", "state"), found, rows, json=json)
+    print_result(found, [table(("site", "robot", "certificate", "enrolled", "state"), rows)], json=json)
 
 
 def list_operators(store: StoreFolder, json: Json = False) -> None:
@@ -33,7 +33,7 @@ def list_operators(store: StoreFolder, json: Json = False) -> None:
         {name: getattr(row, name) for name in ("name", "role", "is_disabled", "sessions", "tokens")} for row in found
     ]
     rows = ((r.name, r.role, r.sessions, r.tokens, "disabled" if r.is_disabled else "") for r in found)
-    print_records(("name", "role", "sessions", "tokens", ""), shown, rows, json=json)
+    print_result(shown, [table(("name", "role", "sessions", "tokens", ""), rows)], json=json)
 
 
 def list_incidents(
@@ -51,7 +51,7 @@ def list_incidents(
     with open_store(store, read_only=True) as maps:
         found = incidents(maps, Fleet(maps), settings_of(context).alerts, inbox, site)
     rows = ((one.id, one.state, one.assignee, one.words) for one in found)
-    print_records(("incident", "state", "who", "what"), found, rows, json=json)
+    print_result(found, [table(("incident", "state", "who", "what"), rows)], json=json)
 
 
 ROBOTS = Group("Known robots of a store, and those enrolled at its server.", {"list": list_robots})

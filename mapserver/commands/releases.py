@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_json, print_result, print_table
+from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_result, table
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from fleetmap.mapformat.manifest import Manifest
     from mapserver.releases import Difference
     from mapserver.store import Event, MapStore, VerdictRow, VersionInfo
@@ -21,14 +23,11 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
     with open_store(store, read_only=True) as maps:
         infos = maps.versions(site)
         trusted = {info.version: maps.trusted(info) for info in infos}
-    if json:
-        print_json([asdict(info) | {"trusted_calibrations": trusted[info.version]} for info in infos])
-        return
+    shown = [asdict(info) | {"trusted_calibrations": trusted[info.version]} for info in infos]
     columns = ("version", "state", "parent", "created", "tiles", "landmarks")
-    print_table((*columns, "bytes"), ((*(getattr(i, name) for name in columns), i.map_bytes) for i in infos))
-    for version, choices in trusted.items():
-        for choice in choices:
-            typer.echo(f"version {version}: {choice.sentence}")
+    rows = ((*(getattr(info, name) for name in columns), info.map_bytes) for info in infos)
+    words = [f"version {version}: {choice.sentence}" for version, choices in trusted.items() for choice in choices]
+    print_result(shown, [table((*columns, "bytes"), rows), *words], json=json)
 
 
 def inspect(
@@ -121,22 +120,19 @@ def diff(
 
     with open_store(store, read_only=True) as maps:
         found = releases.difference(maps, site, before, after)
-    if json:
-        print_json(found)
-    else:
-        _print_difference(found)
+    print_result(found, _difference_words(found), json=json)
 
 
-def _print_difference(found: "Difference") -> None:
+def _difference_words(found: "Difference") -> "Iterator[str | Table]":
     counts = [
         ("tiles", found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept),
         ("landmarks", found.landmarks_added, found.landmarks_moved, found.landmarks_removed, found.landmarks_kept),
     ]
     title = f"{found.site}: {found.before} to {found.after}"
-    print_table(("", "added", "changed", "removed", "kept"), counts, title)
+    yield table(("", "added", "changed", "removed", "kept"), counts, title)
     if found.moved_max_m is not None and found.moved_median_m is not None:
-        typer.echo(f"landmarks moved by {found.moved_median_m:.4f} m in the median, {found.moved_max_m:.4f} m at most")
+        yield f"landmarks moved by {found.moved_median_m:.4f} m in the median, {found.moved_max_m:.4f} m at most"
     share = found.fetch_bytes / max(1, found.full_bytes)
-    typer.echo(f"a robot with version {found.before} fetches {found.fetch_bytes} bytes ({share:.1%} of everything)")
+    yield f"a robot with version {found.before} fetches {found.fetch_bytes} bytes ({share:.1%} of everything)"
     quality = ((key, both.before, both.after) for key, both in found.quality.items())
-    print_table(("quality", str(found.before), str(found.after)), quality)
+    yield table(("quality", str(found.before), str(found.after)), quality)

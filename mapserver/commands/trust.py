@@ -10,7 +10,7 @@ import typer
 
 from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, StoreFolder, open_store, print_json, print_table
+from mapserver.commands.options import Json, StoreFolder, open_store, print_result, table
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
@@ -144,19 +144,15 @@ def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
 
 def status(store: StoreFolder, json: Json = False) -> None:
     """Show every role with its keys and days until expiry; status 1 if robots cannot accept new maps, now or soon."""
-    from fleetmap.console import plain_console
+    from rich.text import Text
+
     from mapserver.trust.status import trust_status
 
     with open_store(store, read_only=True) as maps:
         found = trust_status(maps)
-    if json:
-        print_json(found)
-    else:
-        rows = ((r.role, r.number, r.days_left and f"{r.days_left:.1f}", r.fault) for r in found.roles)
-        print_table(("role", "number", "days left", ""), rows)
-        for style, lines in (("yellow", found.risks), ("red", found.faults)):
-            for words in lines:
-                plain_console().print(words, style=style)
+    rows = ((r.role, r.number, r.days_left and f"{r.days_left:.1f}", r.fault) for r in found.roles)
+    told = [*(Text(risk, "yellow") for risk in found.risks), *(Text(fault, "red") for fault in found.faults)]
+    print_result(found, [table(("role", "number", "days left", ""), rows), *told], json=json)
     if found.faults:
         raise typer.Exit(1)
 

@@ -11,7 +11,7 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, config_path
 from fleetmap.errors import RecordingError, UsageError, disk_errors
-from mapserver.commands.options import Calibration, check_output, print_table, topics_of
+from mapserver.commands.options import Calibration, check_output, print_result, table, topics_of
 
 if TYPE_CHECKING:
     from fleetmap.recordings import Recording, Topics
@@ -63,7 +63,7 @@ def calibrate(
     title = f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
     verdicts = ("measured" if p.is_judged else f"not judged: {p.reason}" for p in estimate.parameters)
     rows = ((p.name.value, *_in_words(p), said) for p, said in zip(estimate.parameters, verdicts, strict=True))
-    print_table(("parameter", "correction", "sigma", "verdict"), rows, title)
+    print_result(estimate, [table(("parameter", "correction", "sigma", "verdict"), rows, title)])
     if out is None:
         return
     if not any(p.is_judged for p in estimate.parameters):

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile
-from mapserver.commands.options import Json, print_json, print_table
+from mapserver.commands.options import Json, print_result, table
 
 
 def evaluate(
@@ -35,8 +35,5 @@ def evaluate(
         typer.echo(f"note: {issue.what}: {issue.detail}", err=True)
     spread = None if covariances is None else read_covariances(covariances)
     found = summary(*trajectories, frames=frames, from_first=from_first, covariances=spread)
-    if json:
-        print_json(found)
-        return
     rows = ((key, f"{value:.5g}" if isinstance(value, float) else str(value)) for key, value in found.items())
-    print_table(("error", "value"), rows, f"{estimate.name} against {ground_truth.name}")
+    print_result(found, [table(("error", "value"), rows, f"{estimate.name} against {ground_truth.name}")], json=json)
