@@ -69,7 +69,7 @@ def replace_areas(
 ) -> dict[str, Any]:
     """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
     store.current(site)
-    kept = building.replace_areas(store, site, data, by, tag=_given(if_match))
+    kept = building.keep_areas(store, site, data, None, by, tag=_given(if_match))
     _tag(response, store, site)
     return kept.geojson(site)
 

@@ -34,20 +34,30 @@ Corners = Sequence[tuple[float, float]]
 
 
 def keep_areas(
-    store: MapStore, site: str, data: bytes | None, detail: str, actor: Actor, *, tag: str | None = None
+    store: MapStore, site: str, data: bytes | None, detail: str | None, actor: Actor, *, tag: str | None = None
 ) -> Areas:
-    """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log. A survey
-    of new areas to forget is requested.
+    """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log, None for the names
+    that come and go. Areas that were drawn in the building stay in its frame: they move with the alignment. A survey of new areas to
+    forget is requested.
 
     tag: `areas_tag` of the areas that were looked at, None for any. UsageError for an unknown site, for invalid areas, for a mask
     outside of the map and a correction without a reason, ChangedError if somebody changed them since.
     """
-    current, before = store.current(site), store.areas(site)
+    current, before, areas = store.current(site), store.areas(site), Areas()
     if data is not None:
-        areas = _read(store, site, data)
+        alignment = store.alignment(site)
+        areas = read_areas(data, None if alignment is None else alignment.frame)
         if current is not None:
             check_masks_on_map(areas, store.manifest(site, current.version))
+        if alignment is not None and before.frame == "building" and areas.frame == "map":
+            data = to_json(areas.geojson(site, alignment.frame))
         data = _dated(data, areas, before, actor, store.now_ns())
+    if detail is None:
+        added, removed = (
+            sorted({*these.names} - {*others.names}) for these, others in ((areas, before), (before, areas))
+        )
+        words = [f"{done} {', '.join(names)}" for done, names in (("added", added), ("removed", removed)) if names]
+        detail = "; ".join(words)[:2000] or "changed"
     store.keep_site_files(site, {AREAS: data}, detail, actor=actor, areas_tag=tag)
     after, known = store.areas(site), {area.correction for area in before.corrections}
     for area in after.corrections if current is not None else ():
@@ -67,7 +77,7 @@ def correct_area(store: MapStore, site: str, name: str, kind: CorrectionKind | N
         )
     correction = None if kind is None else Correction(kind, _one_line(actor.reason))
     changed = [replace(area, correction=correction) if area.name == name else area for area in areas.areas]
-    return replace_areas(store, site, to_json(Areas.of(changed).geojson(site)), actor, tag=store.areas_tag(site))
+    return keep_areas(store, site, to_json(Areas.of(changed).geojson(site)), None, actor, tag=store.areas_tag(site))
 
 
 def undo_areas(store: MapStore, site: str, actor: Actor) -> Areas:
@@ -79,11 +89,6 @@ def undo_areas(store: MapStore, site: str, actor: Actor) -> Areas:
         raise StateError(f"the areas of site {site} were never changed; there is nothing to undo")
     store.keep_site_files(site, {AREAS: store.site_file(site, AREAS_BEFORE)}, "last change undone", actor=actor)
     return store.areas(site)
-
-
-def _read(store: MapStore, site: str, data: bytes) -> Areas:
-    alignment = store.alignment(site)
-    return read_areas(data, None if alignment is None else alignment.frame)
 
 
 def _dated(data: bytes, areas: Areas, before: Areas, actor: Actor, now_ns: int) -> bytes:
@@ -119,16 +124,6 @@ def _is_same(before: Area, after: Area) -> bool:
     return corners[0] == corners[1] and all(
         np.allclose(a, b, rtol=0, atol=1e-3) for a, b in zip(before.rings, after.rings, strict=True)
     )
-
-
-def replace_areas(store: MapStore, site: str, data: bytes, actor: Actor, *, tag: str | None) -> Areas:
-    """As `keep_areas`, with the names in the log. Areas that were drawn in the building stay in its frame: they move with the alignment."""
-    alignment, before, after = store.alignment(site), store.areas(site), _read(store, site, data)
-    if alignment is not None and before.frame == "building" and after.frame == "map":
-        data = to_json(after.geojson(site, alignment.frame))
-    added, removed = (sorted({*these.names} - {*others.names}) for these, others in ((after, before), (before, after)))
-    words = [f"{done} {', '.join(names)}" for done, names in (("added", added), ("removed", removed)) if names]
-    return keep_areas(store, site, data, "; ".join(words)[:2000] or "changed", actor, tag=tag)
 
 
 def estimate_alignment(

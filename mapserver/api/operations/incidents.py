@@ -42,7 +42,7 @@ def assign(caller: Caller, incident: Id, to: Owner, *, inbox: InboxFolder = None
 @operation("/v1/incidents/comment", "incidents comment")
 def comment(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
     """Add the reason to what is known of an incident; its state stays."""
-    if not caller.actor.reason:
+    if not caller.actor.reason.strip():
         raise InvalidValueError("a comment is the `reason` of its act; write one")
     return _noted(caller, incident, "commented", inbox, ("open", "acknowledged", "closed"))
 

@@ -17,7 +17,7 @@ from fleetmap.messages import InitialPoseMessage, RobotHealth, decode_message, r
 from locclient.identity import RobotIdentity
 from mapserver import releases
 from mapserver.cli import app
-from mapserver.fleet.building import ask_for_survey, end_request, replace_areas
+from mapserver.fleet.building import ask_for_survey, end_request, keep_areas
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.trust import init_here
@@ -192,7 +192,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         shape = {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]}
         found["features"][0]["properties"]["lift"] = "A"
         found["features"].append({"type": "Feature", "geometry": shape, "properties": {"name": "gate"}})
-        replace_areas(store, SITE, to_json(found), Actor("bob"), tag=None)
+        keep_areas(store, SITE, to_json(found), None, Actor("bob"))
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
         expect(dialog.get_by_role("alert")).to_contain_text("were changed meanwhile; load them anew")
         dialog.get_by_role("button", name="No, change nothing").click()

@@ -26,7 +26,7 @@ from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.drafting.job_lock import log_path
-from mapserver.fleet.building import align, ask_for_survey, replace_areas
+from mapserver.fleet.building import align, ask_for_survey, keep_areas
 from mapserver.fleet.fleet import Fleet
 from mapserver.floor_plan.pins import parse_pin
 from mapserver.operators.operators import Operators
@@ -136,7 +136,7 @@ def answers(
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
         align(store, "hall", [parse_pin(pin) for pin in PINS], None, None, Actor("ada"))
-        replace_areas(store, "hall", AREAS, Actor("ada"), tag=None)
+        keep_areas(store, "hall", AREAS, None, Actor("ada"))
         fleet.take_health("hall", "r1", RobotHealth(site="hall", robot="r1", stamp_ns=5, version=1, status="LOST"))
         fleet.flush()
         init_here(store)
