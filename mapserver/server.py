@@ -120,7 +120,7 @@ class Server:
         if drives is not None:
             usual.append(BackgroundTask("building robots' drives", 60.0, drives.build))
         api = ApiSettings(self.guard, settings, self.certificate, webhook, nights)
-        app = create_app(maps, fleet, metrics, self.bus, lifespan, api)
+        app = create_app(maps, fleet, api, metrics=metrics, bus=self.bus, lifespan=lifespan)
         install_dashboard(app, maps, fleet, api, bus_service.hear)
         alerts = tasks.alert_tasks(maps, fleet, settings.alerts, webhook)
         closing = [each.close for each in (nights, webhook, bus_service) if each is not None]

@@ -48,12 +48,14 @@ router = APIRouter()
 def create_app(
     store: MapStore,
     fleet: Fleet,
-    metrics: Metrics,
-    bus: Bus | None,
-    lifespan: Lifespan | None = None,
     settings: p.ApiSettings = USUAL_SETTINGS,
+    *,
+    metrics: Metrics | None = None,
+    bus: Bus | None = None,
+    lifespan: Lifespan | None = None,
 ) -> FastAPI:
-    """Return the application over an open store. `bus`: checked for readiness, and notifies robots; None if the server has none."""
+    """Return the application over an open store. metrics: with counts of its bus. `bus`: checked for readiness, and notifies robots."""
+    metrics = metrics or Metrics(store, fleet)
     app = FastAPI(
         title="fleetmap",
         description="Versions of maps, the robots that use them, and the jobs that make them.",

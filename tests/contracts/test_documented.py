@@ -52,7 +52,7 @@ def test_endpoints_are_documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         metrics = Metrics(store, fleet)
-        paths = set(create_app(store, fleet, metrics, None).openapi()["paths"])
+        paths = set(create_app(store, fleet, metrics=metrics).openapi()["paths"])
         families = set(re.findall(r"^# TYPE (fleetmap_\w+)", metrics.text().decode(), re.MULTILINE))
     documented = {code_words(row[0])[0] for row in rows(section(SERVICE, "HTTP"))}
     assert documented == paths | {"/openapi.json"}

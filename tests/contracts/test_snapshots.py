@@ -16,7 +16,6 @@ import typer.core
 
 from fleetmap.hooks import plugins
 from mapserver.api.app import create_app
-from mapserver.api.metrics import Metrics
 from mapserver.cli import app
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
@@ -75,8 +74,7 @@ def is_as_kept(name: str, text: str) -> bool:
 def test_openapi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapserver.api.app.plugins", lambda _: {})  # without plug-ins
     with MapStore.open(tmp_path, create=True) as store:
-        fleet = Fleet(store)
-        document = create_app(store, fleet, Metrics(store, fleet), None).openapi()
+        document = create_app(store, Fleet(store)).openapi()
     assert is_as_kept("openapi.json", json.dumps(document, indent=1, sort_keys=True) + "\n")
 
 

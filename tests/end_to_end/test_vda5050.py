@@ -19,7 +19,6 @@ import uvicorn
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import sha256_hex
 from mapserver.api.app import create_app
-from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -33,7 +32,7 @@ FRAMES, CARRIED_AT = 1100, 490
 
 @contextmanager
 def http_server(store: MapStore, fleet: Fleet) -> Iterator[str]:
-    app = create_app(store, fleet, Metrics(store, fleet), None)
+    app = create_app(store, fleet)
     server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -19,17 +19,15 @@ from fleetmap.errors import StoreError
 from mapserver.api import request_limits
 from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
-from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.install import install_sign_in
 from mapserver.operators.operators import IDLE_S, Operators
 from mapserver.store import Actor
 from support.fleet.quick_passwords import use_quick_passwords
-from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import Server, check_problem, named, served_api
 from support.storage.map_samples import save_sample_draft
 
 PASSWORD = "a password of the test"
-ROLES = {"vic": "viewer", "olga": "operator", "ada": "admin"}
 EVIL = "http://evil.example"
 ACT = {"actor": "ada", "reason": "monday"}
 PUBLISH = "/v1/sites/lab/versions/2/publish"
@@ -46,7 +44,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 def client_of(server: Server, *, is_guarded: bool = True, **settings: object) -> Iterator[TestClient]:
     """A client of an application with these settings of the guard, or without it."""
     guard = GuardSettings(operators=Operators(server.store), **settings)
-    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, None, ApiSettings(guard))
+    app = create_app(server.store, server.fleet, ApiSettings(guard))
 
     @app.websocket("/socket")
     async def socket(websocket: WebSocket) -> None:
@@ -57,14 +55,6 @@ def client_of(server: Server, *, is_guarded: bool = True, **settings: object) ->
         app.user_middleware = [layer for layer in app.user_middleware if layer.cls is not Guard]
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False, follow_redirects=False) as client:
         yield client
-
-
-def named(server: Server) -> dict[str, dict[str, str]]:
-    """A session of each role, as headers."""
-    operators = Operators(server.store)
-    for name, role in ROLES.items():
-        operators.add(name, role, PASSWORD, Actor("root"))
-    return {name: {"Cookie": f"fleetmap={operators.sign_in(name, PASSWORD, name).session}"} for name in ROLES}
 
 
 ELSEWHERE = (

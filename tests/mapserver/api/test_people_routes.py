@@ -14,8 +14,8 @@ from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import named as sessions
 
-ROLES = {"vic": "viewer", "olga": "operator", "ada": "admin"}
 WHY = {"reason": "monday"}
 ACTS = (
     ("/v1/operators", {"name": "bob", "role": "viewer"}, "operators"),
@@ -42,13 +42,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
         yield made
 
 
-@pytest.fixture
-def named(server: Server) -> dict[str, dict[str, str]]:
-    """A session of each role, as headers."""
-    operators = Operators(server.store)
-    secrets = {name: operators.add(name, role, None, Actor("root")) for name, role in ROLES.items()}
-    sessions = {name: operators.sign_in(name, secret, name).session for name, secret in secrets.items()}
-    return {name: {"Cookie": f"fleetmap={session}"} for name, session in sessions.items()}
+named = pytest.fixture(sessions)
 
 
 def token(server: Server, *scopes: str, name: str = "program") -> dict[str, str]:

@@ -13,7 +13,6 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from fleetmap.errors import UsageError
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
-from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.api.sign_in_proxy import PAGE_S, ProxiedPeople, SignInProxy
 from mapserver.commands.serve import HttpOptions
@@ -41,7 +40,7 @@ def asking(server: Server, address: str, later_s: float = 0.0) -> Iterator[TestC
     clock = Clock()
     proxy = SignInProxy(SignInProxy.of([PROXY], GROUPS).addresses, SignInProxy.of([PROXY], GROUPS).roles, clock)
     guard = GuardSettings(operators=Operators(server.store), must_sign_in=True, proxy=proxy)
-    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, None, ApiSettings(guard))
+    app = create_app(server.store, server.fleet, ApiSettings(guard))
 
     inner: ASGIApp = ProxyHeadersMiddleware(app, [PROXY])  # type: ignore[arg-type,assignment]
 

@@ -23,7 +23,6 @@ from fleetmap.messages import CameraNote, Placement, RobotHealth, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
-from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.drafting.job_lock import log_path
 from mapserver.fleet.building import align, ask_for_survey, keep_areas
@@ -159,7 +158,7 @@ def answers(
         nights = NightRuns(store, tmp_path / "inbox")
         monkeypatch.setattr(nights, "start", lambda site, log: store.job(1))
         settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver, nights=nights)
-        app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
+        app = create_app(store, fleet, settings, bus=bus)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app, headers=headers)
         found = {
             operation.ok().label: ask_operation(operation.ok(), known, headers, chosen)

@@ -11,11 +11,11 @@ from fastapi.testclient import TestClient
 from starlette.types import Message
 
 from mapserver.api.app import create_app
-from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.fleet.fleet import Fleet
+from mapserver.operators.operators import Operators
 from mapserver.serving.night_runs import NightRuns
-from mapserver.store import MapStore
+from mapserver.store import Actor, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import publish_samples, save_sample_draft
 
@@ -40,9 +40,16 @@ def served_api(folder: Path, inbox: Path | None = None) -> Iterator[Server]:
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
         settings = ApiSettings(nights=None if inbox is None else NightRuns(store, inbox))
-        app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
+        app = create_app(store, fleet, settings, bus=bus)
         with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False, client=("127.0.0.1", 9)) as client:
             yield Server(client, store, fleet, bus, folder)
+
+
+def named(server: Server) -> dict[str, dict[str, str]]:
+    """A session of each role, as headers."""
+    operators, roles = Operators(server.store), {"vic": "viewer", "olga": "operator", "ada": "admin"}
+    secrets = {name: operators.add(name, role, None, Actor("root")) for name, role in roles.items()}
+    return {name: {"Cookie": f"fleetmap={operators.sign_in(name, secrets[name], name).session}"} for name in roles}
 
 
 def check_problem(response: httpx.Response, status: int, words: str) -> None:

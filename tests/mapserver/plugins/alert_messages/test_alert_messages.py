@@ -13,7 +13,6 @@ from fastapi.testclient import TestClient
 
 from fleetmap.errors import UsageError
 from mapserver.api.app import create_app
-from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.fleet import Fleet
@@ -110,8 +109,7 @@ def test_a_token_that_cannot_be_read_is_told_at_once(tmp_path: Path) -> None:
 
 def ask(store: MapStore, sender: Webhook | None) -> httpx.Response:
     """The answer to a request for a test alert."""
-    fleet = Fleet(store)
-    app = create_app(store, fleet, Metrics(store, fleet), None, None, ApiSettings(webhook=sender))
+    app = create_app(store, Fleet(store), ApiSettings(webhook=sender))
     with TestClient(app, "http://127.0.0.1") as client:
         return client.post("/v1/alerts/test", json={"actor": "ada", "reason": "new address"})
 
