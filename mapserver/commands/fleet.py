@@ -1,9 +1,7 @@
 """`mapserver fleet`: fleet health as a page, as files for other programs, and as a route for the next survey."""
 
-import sys
 import time
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fleetmap.cli_options import ConfigFile, Group, expand_options, settings_of
-from fleetmap.errors import StateError, UsageError
+from fleetmap.errors import UsageError
 from fleetmap.log_lines import printable
 from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder, open_store, print_result, write_output
 
@@ -108,20 +106,16 @@ def replay(
     json: Json = False,
 ) -> None:
     """Replay a failure with the present localizer, in the robot's map or in another version."""
-    from mapserver.fleet.bounded_process import ProcessLimits, run_bounded, without_network
+    from mapserver.fleet.bounded_process import ProcessLimits, client_command, run_bounded, without_network
 
-    if find_spec("locclient") is None:
-        raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
     with open_store(store, read_only=True) as maps, TemporaryDirectory() as folder:
         path = Path(folder) / f"failure-{failure}.mcap"
         path.write_bytes(maps.fleet.replay(failure))
         site = maps.fleet.failure(failure).failure.site
         report = Path(folder) / "report.json"
-        options = ["--store", str(store), "--site", site, "--report", str(report)]
-        if version is not None:
-            options += ["--version", str(version)]
-        # In a separate process: the server does not import the robot's side (ARCHITECTURE.md), and the file is from a robot.
-        command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
+        options = ["--store", store, "--site", site, "--report", report]
+        options += [] if version is None else ["--version", version]
+        command = client_command("replay", path, *options)  # the file is from a robot
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
         output = report.read_text("utf-8") if json and report.exists() else done.stdout
     if not without_network():

@@ -5,11 +5,13 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from tempfile import TemporaryFile
 
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, StateError
 
 _NO_NETWORK = ("--map-current-user", "--net", "--")
 
@@ -35,6 +37,13 @@ class ProcessLimits:
             hard = resource.getrlimit(kind)[1]
             limit = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
             resource.prlimit(process_id, kind, (limit, limit))
+
+
+def client_command(*words: object) -> list[str]:
+    """Return a command of the robots' client, which the server does not import (ARCHITECTURE.md); StateError if it is missing."""
+    if find_spec("locclient") is None:
+        raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
+    return [sys.executable, "-m", "locclient.cli", *map(str, words)]
 
 
 def without_network() -> list[str]:

@@ -97,7 +97,7 @@ def decode_archive(data: bytes) -> SurveyMap:
         raise MapFormatError(f"archive: {len(payload)} bytes are too few for its head; the bytes are damaged")
     offset = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
     head = decode_json(payload[_HEAD_SIZE.size : offset], _Head, "archive: head {}; the bytes are damaged")
-    arrays: dict[str, AnyArray] = {}
+    arrays: dict[str, Any] = {}
     for entry in head.arrays:
         if entry.name not in _ARRAYS or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
             reason = f"archive: array {entry.name!r} of {entry.dtype!r} is unknown; the bytes are damaged"
@@ -114,10 +114,9 @@ def decode_archive(data: bytes) -> SurveyMap:
         raise MapFormatError(reason)
     _check(arrays)
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
-    remembered: dict[str, Any] = {name: arrays.pop(name) for name in _HISTORY}
-    remembered |= {"next_keyframe_id": head.next_keyframe_id, "next_landmark_id": head.next_landmark_id}
-    fields: dict[str, Any] = {"camera": head.camera, "scale_known": head.scale_known, "trajectory": trajectory}
-    return SurveyMap(**fields | arrays, history=History(**remembered))
+    remembered = {name: arrays.pop(name) for name in _HISTORY}
+    history = History(next_keyframe_id=head.next_keyframe_id, next_landmark_id=head.next_landmark_id, **remembered)
+    return SurveyMap(camera=head.camera, scale_known=head.scale_known, trajectory=trajectory, history=history, **arrays)
 
 
 def _check(arrays: dict[str, AnyArray]) -> None:

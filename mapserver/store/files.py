@@ -61,6 +61,15 @@ def is_plain_file(path: Path) -> bool:
         return False
 
 
+def file_mark(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes with a file; None if it is missing."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_mtime_ns, status.st_ino, status.st_size
+
+
 def make_own_file(path: Path) -> None:
     """Create an empty private file, unless it exists."""
     os.close(_open_own(path))

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 
 import msgspec
 
@@ -22,7 +21,7 @@ from fleetmap.mapformat.names import check_name
 from fleetmap.messages import encode_message
 from fleetmap.trust.enrolment import Bundle, RenewalAnswer, certificate_info, check_request, key_fingerprint
 from mapserver.store import NOBODY, Actor, MapStore
-from mapserver.store.files import make_folder
+from mapserver.store.files import file_mark, make_folder
 from mapserver.trust.authorities import DAYS, Authorities
 from mapserver.trust.lists import SignedLists
 
@@ -151,7 +150,7 @@ class RobotRegister:
 
     def state(self) -> object:
         """Return a value that changes with robots, buildings, an authority or the server's certificate."""
-        return (_stamp(self._path), self.tls_state(), [self._floors(info.site) for info in self.store.sites()])
+        return (file_mark(self._path), self.tls_state(), [self._floors(info.site) for info in self.store.sites()])
 
     def _floors(self, site: str) -> tuple[str, ...]:
         """Return the other floors of a site's building."""
@@ -160,7 +159,7 @@ class RobotRegister:
 
     def tls_state(self) -> object:
         tls = self.authorities.tls
-        return (_stamp(tls.authority), _stamp(tls.own))
+        return (file_mark(tls.authority), file_mark(tls.own))
 
     def enrol(self, site: str, robots: Sequence[str], endpoint: str, *, actor: Actor = NOBODY) -> dict[str, bytes]:
         """Return the bundle of each robot. An unused earlier bundle is replaced and becomes invalid.
@@ -282,11 +281,3 @@ class RobotRegister:
                 if entries != before:
                     ordered = [entries[key] for key in sorted(entries)]
                     write_atomically(root / "keys" / self._path.name, [to_json(ordered)])
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    try:
-        stat = path.stat()
-    except FileNotFoundError:
-        return None
-    return stat.st_mtime_ns, stat.st_ino, stat.st_size

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from fleetmap.errors import StoreError, UntrustedError, disk_errors
 from fleetmap.messages import WantedVersion
 from fleetmap.trust.site_list import SiteList, read_site_list, site_role
-from mapserver.store.files import is_plain_file
+from mapserver.store.files import file_mark, is_plain_file
 
 if TYPE_CHECKING:
     from tuf.api.metadata import DelegatedRole, Metadata
@@ -106,11 +106,8 @@ class SignedLists:
 
     def served(self, site: str) -> SiteList | None:
         """Return the present list for robots of a site; None before the first."""
-        try:
-            status = self.path(TIMESTAMP, 0).stat()
-        except FileNotFoundError:
+        if (mark := file_mark(self.path(TIMESTAMP, 0))) is None:
             return None
-        mark = (status.st_mtime_ns, status.st_ino)
         if self._known[0] != mark:
             self._known = (mark, {})
         known = self._known[1]

@@ -1,11 +1,9 @@
 """A drive through a site: replayed by the robots' program, and its pictures localized in the version's tiles."""
 
 import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import decode_vocabulary
-from fleetmap.errors import FleetmapError, RecordingError, StateError
+from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
@@ -29,6 +27,7 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
 from mapserver.doctor import Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
+from mapserver.fleet.bounded_process import client_command
 from mapserver.plugins.acceptance.figures import QUANTILES, DriveFigures, quantile
 from mapserver.plugins.acceptance.ladders import ladders
 from mapserver.quality.probes import Probe, probe_features, relocalized, spread
@@ -134,8 +133,6 @@ class Reference(NamedTuple):
 
 def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport, Trajectory]:
     """Replay a drive, and its starts, by `locclient replay` in a process of its own; return its report and the localized frames."""
-    if find_spec("locclient") is None:
-        raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
     with TemporaryDirectory() as folder:
         report, trajectory = Path(folder) / "report.json", Path(folder) / "trajectory.tum"
         named = {
@@ -144,8 +141,7 @@ def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport
         }  # fmt: skip
         if request.opening.calibration_file is not None:
             named["--calibration"] = request.opening.calibration_file
-        words = [word for name, value in named.items() for word in (name, str(value))]
-        command = [sys.executable, "-m", "locclient.cli", "replay", str(request.path), *words]
+        command = client_command("replay", request.path, *(word for option in named.items() for word in option))
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
         if done.returncode not in (0, _NEVER_LOCALISED):
             raise FleetmapError((done.stderr.strip().splitlines() or [f"replay of {request.path} failed"])[-1])

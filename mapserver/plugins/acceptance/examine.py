@@ -120,14 +120,14 @@ def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaF
             setattr(starts, start.outcome, getattr(starts, start.outcome) + 1)
         for picture in drive.pictures:
             found = area(picture.probe.map_from_cam[:2, 3])
-            found.frames.add(picture.is_fixed)
+            found.frames += Count(int(picture.is_fixed), 1)
             found.wrong += picture.is_wrong
             greys[found.name].append(picture.grey)
             if picture.error_m is not None and not picture.is_wrong:
                 found.errors_mm.append(round(1e3 * picture.error_m, 2))
             for kind, ladder in (("darkness", found.darkness), ("blur", found.blur)):
                 for level, (_, is_fixed) in picture.rungs[kind].items():
-                    ladder.setdefault(str(level), Count()).add(is_fixed)
+                    ladder[str(level)] = ladder.get(str(level), Count()) + Count(int(is_fixed), 1)
     for name, levels in greys.items():
         figures[name].grey = float(np.median(levels))
     return [figures[name] for name in sorted(figures)]

@@ -20,10 +20,6 @@ class Count(msgspec.Struct):
     hits: int = 0
     tries: int = 0
 
-    def add(self, hit: bool) -> None:
-        self.hits += hit
-        self.tries += 1
-
     def __add__(self, other: "Count") -> "Count":
         return Count(self.hits + other.hits, self.tries + other.tries)
 
@@ -162,7 +158,6 @@ class Report(Numbered, kw_only=True):
         """All areas together."""
         sums = AreaFigures(ALL)
         for area in self.areas:
-            sums.places += area.places
             sums.wrong += area.wrong
             sums.frames += area.frames
             sums.errors_mm = [*sums.errors_mm, *area.errors_mm]

@@ -98,7 +98,8 @@ def restore(
                     f"{folder} holds {others[0]!r} already; name a new folder, so that nothing is overwritten"
                 )
             name, snapshot = target.read(name)
-            needed, free = snapshot.written_bytes(), shutil.disk_usage(folder).free
+            pieces = sum(map(len, snapshot.files.values()))  # one counts as often as it is named
+            needed, free = sum(snapshot.blobs.values()) + PIECE_BYTES * pieces, shutil.disk_usage(folder).free
             if needed > free:
                 words = f"the snapshot has up to {needed} bytes, the disk of {folder} {free}"
                 raise StoreError(f"{words}; name a folder with more room")

@@ -57,10 +57,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
         pieces = dict.fromkeys([*keys, *(piece for pieces in self.files.values() for piece in pieces)], PIECE_BYTES)
         return {**pieces, **self.blobs}
 
-    def written_bytes(self) -> int:
-        """Return what a restoration writes at most: a piece counts as often as it is named."""
-        return sum(self.blobs.values()) + PIECE_BYTES * sum(len(pieces) for pieces in self.files.values())
-
 
 class BackupTarget:
     """Objects and snapshots under one URL or in one folder, created if needed. Raises StoreError if it cannot be reached."""

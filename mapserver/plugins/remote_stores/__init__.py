@@ -3,15 +3,7 @@
 from collections.abc import Callable
 
 from fleetmap.errors import UsageError
-from mapserver.store.blobs import Objects
 from mapserver.store.database import Database
-
-
-def open_bucket(url: str) -> Objects:
-    """Return the objects under a URL; StoreError for one that cannot be opened."""
-    from mapserver.plugins.remote_stores.buckets import BucketObjects
-
-    return BucketObjects(url)
 
 
 def open_postgres(url: str, clock_ns: Callable[[], int], *, create: bool) -> Database:
