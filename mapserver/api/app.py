@@ -33,9 +33,8 @@ from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.operation_routes import router_of_operations
 from mapserver.api.request_limits import RequestLimits
 from mapserver.api.views import Problem
-from mapserver.fleet.alerts import active_alerts
+from mapserver.fleet.alerts import Incident, active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.incidents import Incident
 from mapserver.operators.operators import Operators
 from mapserver.serving.server_health import ServerHealth, server_health
 from mapserver.store import MapStore

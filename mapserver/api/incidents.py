@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.errors import UsageError
-from mapserver.fleet.alerts import AlertSettings, active_alerts
+from mapserver.fleet.alerts import AlertSettings, Incident, active_alerts, with_acts
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.nightly.inbox import Inbox, contents, sites_of
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import FailureRow, MapStore

@@ -72,8 +72,7 @@ def resurvey(
     config: ConfigFile = None,
 ) -> None:
     """List the tiles to resurvey with reasons, requested tiles first; --route writes a route through them."""
-    import json as json_text
-
+    from fleetmap.encoding import to_json
     from mapserver.fleet.resurvey_list import resurvey_list
     from mapserver.fleet_statistics.resurvey_decision import route_csv, route_geojson
 
@@ -81,11 +80,8 @@ def resurvey(
     with open_store(store, read_only=True) as maps:
         found = resurvey_list(maps, site, settings, time.time_ns())
     if route is not None:
-        if route.suffix == ".csv":
-            text = route_csv(found.route)
-        else:
-            text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
-        write_output(route, text.encode())
+        geojson = to_json(route_geojson(found.site, found.version or 0, found.route), indent=1) + b"\n"
+        write_output(route, route_csv(found.route).encode() if route.suffix == ".csv" else geojson)
     print_result(found, _words(found), json=json)
 
 

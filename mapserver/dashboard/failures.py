@@ -15,7 +15,7 @@ from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
 from mapserver.dashboard.fleet_parts import bar_edges
 from mapserver.dashboard.map_layers import Layer, Mark
-from mapserver.fleet.incidents import Incident, with_acts
+from mapserver.fleet.alerts import Incident, with_acts
 from mapserver.store import FailureFilter, FailureRow
 
 AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}

@@ -10,8 +10,8 @@ from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
 from mapserver.dashboard.data import MANY_SITES, Kept
 from mapserver.dashboard.fleet_parts import Trial, trial_of
+from mapserver.fleet.alerts import Incident
 from mapserver.fleet.canary_controller import find
-from mapserver.fleet.incidents import Incident
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_decision import CanarySettings

@@ -13,7 +13,7 @@ from mapserver.dashboard.map_layers import Layer, Outline, Picture, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import AreaCorrections
-from mapserver.fleet.incidents import with_acts
+from mapserver.fleet.alerts import with_acts
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.floor_plan.survey_requests import courses

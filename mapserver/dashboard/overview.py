@@ -18,8 +18,7 @@ from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
-from mapserver.fleet.alerts import dropped_words
-from mapserver.fleet.incidents import Incident, with_acts
+from mapserver.fleet.alerts import Incident, dropped_words, with_acts
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, figure
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS

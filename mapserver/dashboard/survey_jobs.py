@@ -16,7 +16,7 @@ from mapserver.api.incidents import of_inbox
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
-from mapserver.fleet.incidents import with_acts
+from mapserver.fleet.alerts import with_acts
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said

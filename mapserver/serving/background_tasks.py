@@ -11,10 +11,9 @@ from typing import Any
 from fleetmap.errors import BusyError, FleetmapError
 from fleetmap.log_lines import LogLimit
 from mapserver.drafting.job_lock import end_interrupted
-from mapserver.fleet.alerts import HEARD_WITHIN_S, AlertSettings, active_alerts, end_absent
+from mapserver.fleet.alerts import HEARD_WITHIN_S, AlertSettings, active_alerts, acts_after, end_absent
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.incidents import acts_after
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService

@@ -64,8 +64,8 @@ def _noted(
 ) -> Done:
     """Log an act on an incident in one of these states."""
     from mapserver.api.incidents import find
+    from mapserver.fleet.alerts import with_acts
     from mapserver.fleet.fleet import Fleet
-    from mapserver.fleet.incidents import with_acts
     from mapserver.store import INCIDENT
 
     store, served = caller.store, caller.served

@@ -21,8 +21,7 @@ from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
-from mapserver.fleet.alerts import AlertSettings
-from mapserver.fleet.incidents import Incident
+from mapserver.fleet.alerts import AlertSettings, Incident
 from mapserver.store import Event
 
 _ATTEMPT_S = 5.0
