@@ -23,7 +23,7 @@ def bytes_response(request: Request, data: bytes, sha256: str, media_type: str, 
         "Accept-Ranges": "bytes",
         "Cache-Control": "public, max-age=31536000, immutable" if immutable else "no-cache",
     }
-    if _matches(request.headers.get("if-none-match"), etag):
+    if is_held(request, etag):
         return Response(status_code=304, headers=headers)
     span = _span(request, etag, len(data))
     if span is None:
@@ -36,10 +36,9 @@ def bytes_response(request: Request, data: bytes, sha256: str, media_type: str, 
     return Response(data[start:end], 206, media_type=media_type, headers=headers)
 
 
-def _matches(condition: str | None, etag: str) -> bool:
-    if condition is None:
-        return False
-    tags = [tag.strip().removeprefix("W/") for tag in condition.split(",")]
+def is_held(request: Request, etag: str) -> bool:
+    """True if the client says that it has the bytes of this tag."""
+    tags = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
     return "*" in tags or etag in tags
 
 

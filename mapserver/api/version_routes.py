@@ -14,7 +14,7 @@ from fleetmap.mapformat.version_file import ExportHead
 from mapserver import releases
 from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.bytes_response import bytes_response
+from mapserver.api.bytes_response import bytes_response, is_held
 from mapserver.releases import Difference
 from mapserver.store import Event, MapStore, SiteInfo
 
@@ -112,7 +112,7 @@ def version_file(request: Request, store: p.Store, site: p.Site, version: p.Vers
         "Cache-Control": "public, max-age=31536000, immutable",
         "Content-Disposition": f'attachment; filename="{site}-{version}.fmex"',
     }
-    if request.headers.get("if-none-match") == headers["ETag"]:
+    if is_held(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     headers["Content-Length"] = str(head.file_bytes())
     if request.method == "HEAD":
