@@ -71,6 +71,10 @@ class StoreQueries:
         # Every robot asks for requests every few seconds, and an object store answers slowly.
         self._request = lru_cache(_REQUESTS_KEPT)(lambda kind, sha256: read_request(kind, self._blobs.get(sha256)))
 
+    def now(self) -> datetime:
+        """Return the time in UTC, by the store's clock."""
+        return datetime.fromtimestamp(self.now_ns() / 1e9, UTC)
+
     # ---------------------------------------------------------------------------------------------- sites and versions
 
     def sites(self) -> list[SiteInfo]:

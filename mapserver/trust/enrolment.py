@@ -115,7 +115,7 @@ class RobotRegister:
 
     @property
     def authorities(self) -> Authorities:
-        return Authorities(self._keys, datetime.fromtimestamp(self.store.now_ns() / 1e9, UTC))
+        return Authorities(self._keys, self.store.now())
 
     @property
     def tls(self) -> TlsFiles:

@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, cast
@@ -53,7 +53,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
     lists = SignedLists(store.folder)
     if not lists.are_there:
         return
-    now, keys = _now(store), KeyFolder(store.folder / "keys")
+    now, keys = store.now(), KeyFolder(store.folder / "keys")
     if not all_anew and not (keys.has("online") and _online_is_due(lists, now)):
         known = lists.site_roles()
         roles = ((info.site, site_role(info.site)) for info in store.sites())
@@ -227,11 +227,7 @@ def _repository(store: MapStore, root: Path) -> "ListRepository":
     """Return the lists below `root`, to be signed with the keys of the store."""
     from mapserver.trust.repository import ListRepository  # late: tuf comes with it
 
-    return ListRepository(store.folder, _now(store), draft=root)
-
-
-def _now(store: MapStore) -> datetime:
-    return datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+    return ListRepository(store.folder, store.now(), draft=root)
 
 
 def check_base(store: MapStore, info: VersionInfo) -> None:
@@ -331,7 +327,7 @@ def sign_files(store: MapStore, files: Mapping[str, bytes]) -> bytes | None:
     if signer is None:
         return None
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
-    signed = _now(store).isoformat(timespec="seconds")
+    signed = store.now().isoformat(timespec="seconds")
     envelope = Envelope(to_json({"signed": signed, "sha256": hashes}), _FILES_TYPE, {})
     envelope.sign(signer)
     return to_json(envelope.to_dict(), indent=2) + b"\n"

@@ -1,7 +1,6 @@
 """State of the signed lists: keys, expiry, and keys exposed to a thief of the server."""
 
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 
 from fleetmap.errors import StateError
 from fleetmap.trust.site_list import site_role
@@ -55,8 +54,7 @@ def trust_status(store: MapStore) -> TrustStatus:
         raise StateError(
             f"{store.folder} has no signed lists; `mapserver trust init --store {store.folder}` makes them"
         )
-    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-    known = lists.site_roles()
+    now, known = store.now(), lists.site_roles()
     for name in ("root", "targets", "snapshot", TIMESTAMP, *known):
         number, fault = lists.newest(name), ""
         if name == TIMESTAMP and lists.path(name, 0).is_file():

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pyrage
@@ -85,7 +84,7 @@ def back_up(
         snapshot = Snapshot(
             store_format=store_format, versions=versions, files=files, blobs=blobs, keys=keys, missing=sorted(missing)
         )
-        name = target.write(snapshot, datetime.fromtimestamp(store.now_ns() / 1e9, UTC))
+        name = target.write(snapshot, store.now())
         removed = [] if missing else target.prune(keep, store.now_ns())  # an older one may have what is missing
     total = sum(upload.sizes[address] for address in snapshot.objects())
     return BackupReport(name, total, upload.count, upload.bytes, bool(keys), tuple(snapshot.missing), tuple(removed))
