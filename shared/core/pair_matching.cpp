@@ -14,30 +14,15 @@ constexpr double kScale = 1.2;   // from octave to octave
 constexpr double kNearM = 1e-6;
 
 using Size = std::tuple<double, double>;  // width and height
-// pixels (N, 2), octaves (N,), descriptors (N, 4), disparities (N, 2), points_cam (N, 3), true if the disparities are measured
+// Features of a keyframe: pixels, octaves, descriptors, disparities with their standard deviations, NaN unknown, points in the camera by
+// those, and true if the keyframe measured the disparities itself.
 using Features = std::tuple<Places, Array<int8_t, -1>, Packed, Places, Points, bool>;
 
-// Features of a keyframe.
-struct KeyframeFeatures {
-  const double* pixels;  // (N, 2)
-  const int8_t* octaves;
-  Descriptors descriptors;
-  const double* disparities;  // (N, 2) with their standard deviations, NaN unknown
-  const Vec3* points_cam;     // by the disparities
-  bool is_measured;           // true if the keyframe measured the disparities itself
-
-  explicit KeyframeFeatures(const Features& features)
-      : pixels(std::get<0>(features).data()),
-        octaves(std::get<1>(features).data()),
-        descriptors(std::get<2>(features)),
-        disparities(std::get<3>(features).data()),
-        points_cam(std::get<4>(features).rows()),
-        is_measured(std::get<5>(features)) {
-    check_rows(count(), "a, b: as many pixels, octaves, disparities and points as descriptors", std::get<0>(features),
-               std::get<1>(features), std::get<3>(features), std::get<4>(features));
-  }
-  size_t count() const { return descriptors.count; }
-};
+void check(const Features& features) {
+  const auto& [pixels, octaves, descriptors, disparities, points_cam, is_measured] = features;
+  check_rows(descriptors.shape(0), "a, b: as many pixels, octaves, disparities and points as descriptors", pixels, octaves, disparities,
+             points_cam);
+}
 
 struct PairGuidance {
   StereoLens lens;
@@ -68,25 +53,26 @@ std::optional<std::array<double, 2>> seen_by(Vec3 point, const StereoLens& lens,
 
 // Matches of a's features with depth into b. Nearer, a feature appears larger and so on a higher octave; there pixels are coarser and the
 // search is wider.
-Pairs project_matches(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const SE3& b_from_a,
-                      double radius_px) {
-  const size_t count = a.count();
+Pairs project_matches(const Features& a, const Features& b, const PairGuidance& guidance, const SE3& b_from_a, double radius_px) {
+  const auto& [pixels, octaves, descriptors, disparities, points_cam, is_measured] = a;
+  const auto& [pixels_b, octaves_b, descriptors_b, disparities_b, points_b, is_measured_b] = b;
+  const size_t count = descriptors.shape(0);
   std::vector<double> predicted(2 * count, kNaN), radius(count, 0.0);
   std::vector<int64_t> span(2 * count, 0);
   for (size_t n = 0; n < count; ++n) {
-    if (!std::isfinite(a.disparities[2 * n])) continue;
-    const Vec3 point = a.points_cam[n], in_b = b_from_a * point;
+    if (!std::isfinite(disparities(n, 0))) continue;
+    const Vec3 point = points_cam.rows()[n], in_b = b_from_a * point;
     const auto seen = seen_by(in_b, guidance.lens, guidance.size_px);
     if (!seen) continue;
     const double nearer = std::min(std::max(point[2] / std::max(in_b[2], 0.05), 0.1), 10.0);
-    const double octave = a.octaves[n] + std::log(nearer) / std::log(kScale);
+    const double octave = octaves(n) + std::log(nearer) / std::log(kScale);
     std::copy(seen->begin(), seen->end(), &predicted[2 * n]);
     span[2 * n] = int64_t(std::floor(octave)) - 2, span[2 * n + 1] = int64_t(std::ceil(octave)) + 2;
     radius[n] = radius_px * coarseness(octave);
   }
   std::vector<int64_t> found(count);
   std::vector<int32_t> distances(count);
-  match_projected({predicted.data(), radius.data(), span.data(), a.descriptors}, {b.pixels, b.octaves, b.descriptors},
+  match_projected({predicted.data(), radius.data(), span.data(), descriptors}, {pixels_b.data(), octaves_b.data(), descriptors_b},
                   guidance.max_distance, kRatio, found.data(), distances.data());
   Pairs pairs;
   for (size_t n = 0; n < count; ++n)
@@ -95,23 +81,24 @@ Pairs project_matches(const KeyframeFeatures& a, const KeyframeFeatures& b, cons
 }
 
 // Whether the pairs give a motion, and their squared residuals.
-bool refine(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const Pairs& pairs, GuidedPair& found,
+bool refine(const Features& a, const Features& b, const PairGuidance& guidance, const Pairs& pairs, GuidedPair& found,
             std::vector<double>& squared) {
+  const auto& [pixels, octaves, descriptors, disparities, points, is_measured] = b;
   ChosenSightings seen, inliers;
   squared.resize(pairs.size());
   for (const auto& [i, j] : pairs) {
-    const double u = b.pixels[2 * j], disparity = b.is_measured ? b.disparities[2 * j] : kNaN, coarse = coarseness(b.octaves[j]);
-    const Vec3 pixel = {u, b.pixels[2 * j + 1], u - disparity};
+    const double u = pixels(j, 0), disparity = is_measured ? disparities(j, 0) : kNaN, coarse = coarseness(octaves(j));
+    const Vec3 pixel = {u, pixels(j, 1), u - disparity};
     const std::array<double, 2> weights = {1.0 / (guidance.sigma_px * coarse), 1.0 / std::max(guidance.sigma_px, coarse)};
-    seen.add({a.points_cam + i, &pixel, &weights, 1}, 0);
+    seen.add({std::get<Points>(a).rows() + i, &pixel, &weights, 1}, 0);
   }
   return refine_twice(seen.all(), guidance.lens, guidance.refinement, {}, found.b_from_a, found.hessian, squared.data(), inliers);
 }
 
 // The matches of a into b, and those of b into a whose features they leave free.
-void match_both_ways(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, double radius_px,
-                     const Pairs& forward, GuidedPair& found) {
-  std::vector<char> taken_a(a.count(), false), taken_b(b.count(), false);
+void match_both_ways(const Features& a, const Features& b, const PairGuidance& guidance, double radius_px, const Pairs& forward,
+                     GuidedPair& found) {
+  std::vector<char> taken_a(std::get<Packed>(a).shape(0)), taken_b(std::get<Packed>(b).shape(0));
   for (const auto& [i, j] : forward) {
     found.pairs.push_back({int32_t(i), int32_t(j)});
     taken_a[size_t(i)] = taken_b[size_t(j)] = true;
@@ -123,7 +110,7 @@ void match_both_ways(const KeyframeFeatures& a, const KeyframeFeatures& b, const
 // Matches a's features into b by projection and finds the motion from them in turn, once for each radius: with so many inliers each time,
 // and the first time with that share of the matches. At the end b's features are matched into a too, to those whose features are still
 // free.
-GuidedPair guided(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const SE3& b_from_a,
+GuidedPair guided(const Features& a, const Features& b, const PairGuidance& guidance, const SE3& b_from_a,
                   const std::vector<double>& radii_px, int least_inliers, double least_share) {
   GuidedPair found;
   found.b_from_a = b_from_a;
@@ -148,9 +135,9 @@ auto match_guided(const Features& a, const Features& b, const SE3& b_from_a, con
                   const Limits& refinement, int max_distance, const Reals& radii_px, int least_inliers, double least_share) {
   if (least_inliers < 0) throw nb::value_error("least_inliers: not negative");
   const PairGuidance guidance{lens, size_px, sigma_px, refinement_of(refinement), max_distance};
-  const KeyframeFeatures ours(a), theirs(b);
+  check(a), check(b);
   GuidedPair found =
-      unlocked([&] { return guided(ours, theirs, guidance, b_from_a, {radii_px.begin(), radii_px.end()}, least_inliers, least_share); });
+      unlocked([&] { return guided(a, b, guidance, b_from_a, {radii_px.begin(), radii_px.end()}, least_inliers, least_share); });
   return std::tuple(found.good, std::move(found.pairs), found.b_from_a, found.hessian);
 }
 

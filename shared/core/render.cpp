@@ -72,12 +72,6 @@ struct Instant {
   size_t shadow_count;
 };
 
-// A picture in the making (H, W): radiance, and depth along the optical axis, 0 for nothing.
-struct Canvas {
-  Picture<double> radiance;
-  float* depth_m;
-};
-
 using Lit = std::tuple<Array<double, -1, 9>, Array<double, -1, 6>, Array<int32_t, -1, 6>, Array<float, -1>, Reals>;
 using Chunks = std::tuple<Array<int32_t, -1, 2>, Array<double, -1, 6>>;
 using Atlas = std::tuple<Array<uint8_t, -1>, Array<int32_t, -1, -1>, Array<int32_t, -1, -1>, Array<int32_t, 2>>;
@@ -299,7 +293,7 @@ class ScenePainter {
     for (size_t i = 0; i < rays_.size(); ++i) std::copy_n(rays.data() + 4 * i, 4, rays_[i].begin());
   }
 
-  // Adds an instant's weighted picture to the canvas, which is of the rays' size, or of the plane's. cam_from_map: rotation.
+  // Adds an instant's weighted picture to pictures of the rays' size, or of the plane's. cam_from_map: rotation.
   void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map, int samples,
            std::tuple<double, double> shift, double weight, int most_taps, double reflectance, const Points& shadows, bool wants_truth,
            const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m) {
@@ -316,7 +310,7 @@ class ScenePainter {
     mirrored_.polygons.clear();
     if (reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
     paint(mirrored_, 1, 0.0, 0.0, std::max<ptrdiff_t>(0, first_row - 6));  // all of one sample per pixel
-    shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data()});
+    shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, radiance, depth_m.data());
   }
 
  private:
@@ -480,9 +474,10 @@ class ScenePainter {
     return seen_.data();
   }
 
-  // Samples of one polygon in a pixel are shaded once, at their mean place; owner: that of each sample.
+  // Samples of one polygon in a pixel are shaded once, at their mean place; owner: that of each sample. depth_m: along the optical axis, 0
+  // for nothing.
   void shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m, const Instant& instant,
-                   const Canvas& canvas) const {
+                   Picture<double> radiance, float* depth_m) const {
     const int samples = instant.samples;
     const double wide_x = 1.0 / plane_.fx, wide_y = 1.0 / plane_.fy, step = 1.0 / samples;
     double per_px_x = wide_x, per_px_y = wide_y;
@@ -552,10 +547,10 @@ class ScenePainter {
             }
           }
           total += value * hits[n];
-          if (instant.wants_truth && n == 0) canvas.depth_m[y * columns_ + x] = float(1.0 / w);
+          if (instant.wants_truth && n == 0) depth_m[y * columns_ + x] = float(1.0 / w);
         }
-        if (instant.wants_truth && seen[0] < 0) canvas.depth_m[y * columns_ + x] = 0.0f;
-        canvas.radiance.row(y)[x] += instant.weight * total * step * step;
+        if (instant.wants_truth && seen[0] < 0) depth_m[y * columns_ + x] = 0.0f;
+        radiance.row(y)[x] += instant.weight * total * step * step;
       }
   }
 
