@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fleetmap.failure_definition import radius_95_m
+from fleetmap.failure_definition import known_radius_m, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
@@ -74,10 +74,9 @@ class Estimate:
         cause = f" ({self.cause.value})" if self.cause.value else ""
         version = "no map" if self.map_version is None else f"version {self.map_version}"
         of_floor = f" of {self.floor}" if self.floor else ""
-        words = f"{self.status.value}{cause}, {version}{of_floor}"
-        if self.map_from_body is None:
-            return words
-        return f"{words}, position known to {radius_95_m(self.cov_rot_trans):.2f} m (95 %)"
+        radius_m = known_radius_m(self.cov_rot_trans)
+        known = "" if radius_m is None else f", position known to {radius_m:.2f} m (95 %)"
+        return f"{self.status.value}{cause}, {version}{of_floor}{known}"
 
     @property
     def views_in_words(self) -> str:
