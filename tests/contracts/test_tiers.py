@@ -27,7 +27,6 @@ def test_each_verb_runs_its_tier() -> None:
     makefile = text("Makefile")
     for verb, selection in (("test", '-m "not long"'), ("test-ci", '-m "not long or ci"'), ("test-all", "")):
         rule = re.search(rf"^{verb}: .*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
-        assert rule is not None
         assert ("-m " in rule[1], selection in rule[1]) == (bool(selection), True), verb
     commands = text(".ci/run")
     assert "make test-ci\n" in commands

@@ -51,7 +51,6 @@ def test_an_mcap_recording_opens_with_everything_in_it(tmp_path: Path) -> None:
     assert len(recording.wheel) > 10
     assert recording.calibration.base_from_body[2, 3] == 0.25
     truth = recording.ground_truth
-    assert truth is not None
     for index, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
         assert truth.at(stamp_ns) is not None
         frame = recording.read_frame(index)

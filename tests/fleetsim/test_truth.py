@@ -1,25 +1,34 @@
 """Pictures against the truth: what KLT tracks must lie where calibration, true depth and true motion put it."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap.geometry import se3_inverse, so3_exp, transform_points
+from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.render.optics import make_optics
 from fleetsim.render.painter import Painter
 from fleetsim.render.renderer import RigRenderer
+from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import Exposure
+from fleetsim.scene.world import World
 from fleetsim.sensors.robots import ROBOTS, nominal_calibration
-from support.worlds.simulated_views import map_from_cam, small_world
 
 Array = NDArray[np.float64]
 MOMENTS_S = (3.0, 6.0, 9.5, 12.0, 14.0)
+BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@cache
+def small_world() -> World:
+    """Two aisles of four bays."""
+    return World(Layout(aisles=2, bays=4), seed=3)
 
 
 def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, RigRenderer]:
@@ -81,7 +90,8 @@ def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
 @pytest.mark.parametrize(("yaw", "pitch"), [(0.0, 0.0), (1.2, 0.0), (0.0, -1.2), (-0.8, 0.6)])
 def test_a_fisheye_shows_what_pinholes_show_there(yaw: float, pitch: float) -> None:
     """Painted on five planes, 190 degrees: a pinhole turned by so much sees the same, but for samples at edges."""
-    world, placed = small_world(), map_from_cam(9.0, 8.4, 0.9, 0.7, 0.05)
+    turned = so3_exp(np.array([0.0, 0.0, 0.7])) @ so3_exp(np.array([0.0, 0.05, 0.0]))
+    world, placed = small_world(), se3(turned @ BODY_FROM_OPTICAL, np.array([9.0, 8.4, 0.9]))
     scene, exposure = world.scene_around(9.0, 8.4), Exposure(0.003, 1.0)
     size, shape = 180, np.array([0.0, 0.0, 0.0, 0.0, -0.17, 0.59])
     fisheye = CameraCalibration("double-sphere", size, size, np.array([46.0, 46.0, 89.5, 89.5]), shape, np.eye(4))

@@ -43,7 +43,6 @@ def repeated(recording: Recording, laps: int, seam: tuple[int, int] | None = Non
     seam: the frame to go back to, and the one at which; by default the two that are most alike.
     """
     stamps_ns, truth = recording.frame_stamps_ns, recording.ground_truth
-    assert truth is not None
     first, last = seam or _seam(truth, stamps_ns)
     start_ns, lap_ns = int(stamps_ns[first]), int(stamps_ns[last] - stamps_ns[first])
     lap = np.arange(first, last)

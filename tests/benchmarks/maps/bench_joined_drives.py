@@ -90,7 +90,6 @@ def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[RecordingSurvey]
     """Of all estimated frames, after one alignment."""
     found, true = list[Array](), list[Array]()
     for trajectory, survey in zip(trajectories, surveys, strict=True):
-        assert survey.truth is not None
         for n in np.flatnonzero(survey.survey.map.trajectory_estimated).tolist():
             place = survey.truth.at(int(trajectory.stamps_ns[n]))
             if place is not None:

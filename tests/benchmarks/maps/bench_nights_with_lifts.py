@@ -126,7 +126,6 @@ def ghosts(store: Path, version: int, recording: Path) -> dict[str, Any]:
         body_from_cam = Rectifier(opened.calibration).body_from_cam
         ids = np.concatenate([decode_tile(maps.blob(tile.sha256)).landmark_ids for tile in manifest.tiles])
         old, new = (decode_archive(maps.archive(SITE, number) or b"") for number in (manifest.parent or 1, version))
-    assert truth is not None
     rows = np.flatnonzero(np.isin(new.landmark_ids, ids))
     seen, reference = np.unique(new.obs_landmark, return_index=True)
     keyframe = new.obs_keyframe[reference[np.searchsorted(seen, rows)]]

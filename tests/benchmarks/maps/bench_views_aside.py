@@ -93,7 +93,6 @@ def left_out(path: Path, survey: SurveyMap) -> Iterator[tuple[int, Probe]]:
     """(Nearest keyframe, frame) of those that made no map, the last first; placed as the recording's truth says."""
     with open_recording(path) as recording:
         truth = recording.ground_truth
-        assert truth is not None
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
         last = len(recording.frame_stamps_ns) - 1
         for number in range(last if last % 2 else last - 1, 0, -6):

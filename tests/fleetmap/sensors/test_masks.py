@@ -79,7 +79,6 @@ def test_points_end_at_the_body() -> None:
     rectifier = Rectifier(masked())
     odometry = make_odometry(rectifier.rig, OdometrySettings())
     clearance_px = rectifier.camera.clearance_px
-    assert clearance_px is not None
     for k in range(1, 20):
         estimate = odometry.handle_stereo(rectifier.rectify(frame_with_body(k * FRAME_NS)))
         at = np.rint(estimate.track_pixels[:, :2]).astype(int).T[::-1]

@@ -20,6 +20,7 @@ from fleetmap.messages import (
     WantedVersion,
     decode_message,
     encode_message,
+    part_of,
     robot_key,
 )
 from fleetmap.sensors.samples import PositionPrior
@@ -165,23 +166,17 @@ def test_a_manifest_of_another_site_is_refused(world: World) -> None:
     publish_samples(world.store, 1, first=3, site="elsewhere")
     foreign = world.store.current("elsewhere")
     told = WantedVersion(site="lab", version=7, manifest_sha256=foreign.manifest_sha256)
-    with MemoryBus(world.hub) as server:
-        # In front of the real server's answers: a server that lies, or whose store was mixed up.
-        world.hub.queryables.insert(0, (robot_key("lab", "r1", "wanted"), lambda *_: encode_message(told), None))
-        world.hub.queryables.insert(
-            0, ("fleetmap/lab/robots/r1/manifests/7", _parts(world.store.blob(foreign.manifest_sha256)), None)
-        )
-        assert not server.closed()
+    manifest = world.store.blob(foreign.manifest_sha256)
+    # In front of the real server's answers: a server that lies, or whose store was mixed up.
+    answers = {
+        "wanted": lambda *_: encode_message(told),
+        "manifests/7": lambda _, question: part_of(manifest, question),
+    }
+    world.hub.queryables[:0] = [(robot_key("lab", "r1", what), answer, None) for what, answer in answers.items()]
     world.step(61.0)
     assert not world.sync.fetched
     assert world.client.active().version == 1
     assert "manifest is of elsewhere" in str(world.ack()["refused"])
-
-
-def _parts(data: bytes):  # type: ignore[no-untyped-def]
-    from fleetmap.messages import part_of
-
-    return lambda _, question: part_of(data, question)
 
 
 def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: World) -> None:

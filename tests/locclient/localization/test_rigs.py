@@ -59,7 +59,6 @@ def driven(
     estimates = estimator_loop.run_localizer(front, east_bound_map(), others=[rear] if has_rear else [])
     known = [(e, truth) for e, truth in zip(estimates, front.map_from_body, strict=True) if e.status is Status.TRACKING]
     for estimate, truth in known:
-        assert estimate.map_from_body is not None
         assert np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) < 0.1
     return estimates
 
@@ -221,11 +220,8 @@ def spoilt(frame: CameraFrame, fault: str, *, is_rear: bool, last: CameraFrame |
     """With a covered view, one that repeats the last image, or one without images; a pair in front without them is black."""
     if fault == "dead" and is_rear:
         return replace(frame, others=(None,))
-    assert last is not None
     view, old = (frame.others[0], last.others[0]) if is_rear else (frame, last)
-    assert view is not None
     bad = replace(view, left=np.zeros_like(view.left), right=np.zeros_like(view.left))
     if fault == "frozen":
-        assert old is not None
         bad = replace(view, left=old.left, right=old.right)
     return replace(frame, others=(bad,)) if is_rear else bad

@@ -71,7 +71,6 @@ def test_a_manifest_says_how_near_look_alikes_are(
     """Those of older servers do not say it."""
     link = LocalMapSource(row[0], "row")
     loaded = TileLoader(link, SETTINGS).load(link.wanted(), PositionBound())
-    assert loaded is not None
     assert replace(loaded, manifest=msgspec.structs.replace(loaded.manifest, report=report)).alias_step_m == step_m
 
 
@@ -79,14 +78,11 @@ def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
     link = LocalMapSource(row[0], "row")
     loader, wanted = TileLoader(link, SETTINGS), link.wanted()
     everywhere = loader.load(wanted, PositionBound())
-    assert everywhere is not None
     assert sorted(everywhere.tiles) == [(x, 0) for x in range(10)]
     near = loader.load(wanted, PositionBound(at(8.0)))
-    assert near is not None
     assert sorted(near.tiles) == [(0, 0), (1, 0), (2, 0)]  # those held within reach and a spare stay
     assert loader.load(wanted, PositionBound(at(8.5))) is None, "nothing changed"
     ahead = loader.load(wanted, PositionBound(at(30.0), np.array([4.0, 0, 0])))
-    assert ahead is not None
     assert sorted(ahead.tiles) == [(x, 0) for x in range(6)]
     loader.keep_only([])
     assert loader.load(wanted, PositionBound(at(8.0))) is not None, "forgotten and read again"
@@ -104,7 +100,6 @@ def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, 
         np.testing.assert_array_equal(bound.position_map_m, [40.0, 0.0, 0.0])
         assert SETTINGS.most_mps * seconds <= bound.radius_m <= SETTINGS.most_mps * seconds + 10
         loaded = loader.load(wanted, bound)
-        assert loaded is not None
         held.append(sorted(x for x, _ in loaded.tiles))
     assert held == [list(range(5)), list(range(6)), list(range(10))]
     found = tracker.handle(estimate(42.0, Status.DEGRADED, x_m=140.0))
@@ -130,7 +125,6 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore]) -> None:
     victim.write_bytes(good[:-7])
     try:
         loaded = loader.load(wanted, PositionBound())
-        assert loaded is not None
         assert len(loaded.tiles) == 9
         assert list(loaded.refused) == [(4, 0)]
         assert loader.load(wanted, PositionBound()) is None, "not read again and again"
@@ -138,7 +132,6 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore]) -> None:
         victim.write_bytes(good)
     loader.retry_refused(wanted)
     mended = loader.load(wanted, PositionBound())
-    assert mended is not None
     assert len(mended.tiles) == 10
     foreign = WantedVersion(site="else", version=1, manifest_sha256=wanted.manifest_sha256)
     with pytest.raises(FleetmapError, match="manifest is of row version 1"):

@@ -169,5 +169,4 @@ class Robot:
         self.localizer.handle_prior(PositionPrior(self.frames * FRAME_NS, map_from_base, covariance, is_revisable))
 
     def error_m(self, estimate: Estimate) -> float:
-        assert estimate.map_from_body is not None
         return float(np.linalg.norm(estimate.map_from_body[:3, 3] - self.map_from_body[:3, 3]))

@@ -208,7 +208,6 @@ def test_a_live_source_takes_the_depth_of_another_camera() -> None:
     queue = Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
     topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
     (back,) = stored.others
-    assert back is not None
     sensors, decoded = SensorMessages(topics, rig), list[CameraFrame]()
     sent = {topics.cam2: back.left, topics.cam2_depth: back.depth, topics.left: stored.left, topics.right: stored.right}
     for k in range(4):
