@@ -198,7 +198,8 @@ class Runtime:
             _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
         for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.versions.held)
-            link.after_frame(outcome, held, self._robot.building, self._robot.visited_versions)
+            visited = {site: loaded.version for site, loaded in self._robot.visited.items()}
+            link.after_frame(outcome, held, self._robot.building, visited)
         was_lost, last = self._figures.search.is_long, self._figures.last
         if last is None or (estimate.status, estimate.floor) != (last.estimate.status, last.estimate.floor):
             _log.info("status %s", estimate.in_words)

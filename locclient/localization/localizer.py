@@ -96,7 +96,7 @@ class Localizer:
 
     def start(self) -> Start | None:
         """Return the state with which another localizer of the same odometry can start; None during a map query, whose fix is missing."""
-        return None if self._query.is_under_way else self._tracker.start(self._query.failed)
+        return None if self._query.job is not None else self._tracker.start(self._query.failed)
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""

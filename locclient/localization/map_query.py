@@ -65,7 +65,7 @@ class MapQuery:
         self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame
-        self._job: TimeSliced[QueryResult] | None = None
+        self.job: TimeSliced[QueryResult] | None = None  # under way
         self._begun: tuple[Percept, RectifiedFrame | None] | None = None  # the frame of that job, or of the last one
         self._begun_ns: int | None = None
         self._slices, self._is_urgent = 1, False  # of that job: slices per frame; started by lost tracks
@@ -74,10 +74,6 @@ class MapQuery:
         # Of each camera, by floor: searched without success from the viewpoint of the gate.
         self._failed_places: list[defaultdict[str, list[Array]]] = [defaultdict(list) for _ in range(cameras)]
         tracker.on_restart.append(self.forget)
-
-    @property
-    def is_under_way(self) -> bool:
-        return self._job is not None
 
     def begin_anew(self) -> None:
         """Cancel a running query: the maps have changed."""
@@ -90,7 +86,7 @@ class MapQuery:
         self.failed = 0
 
     def _cancel(self) -> None:
-        self._job = None
+        self.job = None
         self._tracker.end_query()
 
     def step(self, percept: Percept, frame: RectifiedFrame | None, *, is_riding: bool = False) -> QueryResult:
@@ -118,7 +114,7 @@ class MapQuery:
         is_urgent = percept.has_broken and not self.failed
         if (is_urgent and not self._is_urgent) or odometry.after_gap:
             self._cancel()  # a frame before the break, or before the gap, says little of the robot's present pose
-        if self._job is None and self._maps.by_floor:
+        if self.job is None and self._maps.by_floor:
             begins = percept.query is not None if frame is None else is_urgent or self._is_due(odometry)
             if begins:
                 is_at_once = self._is_sparse(odometry.stamp_ns) or odometry.after_gap
@@ -171,16 +167,16 @@ class MapQuery:
         self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_eager else few
         if not is_at_rest:
             self._failed_places[view].clear()
-        self._job = self._run(percept.query, frame, is_sparse=self._is_sparse(odometry.stamp_ns))
+        self.job = self._run(percept.query, frame, is_sparse=self._is_sparse(odometry.stamp_ns))
 
     def _advance(self, *, is_at_once: bool) -> QueryResult:
-        if self._job is None:
+        if self.job is None:
             return QueryResult()
         try:
             for _ in range(self._slices):
-                next(self._job)
+                next(self.job)
             while is_at_once:
-                next(self._job)
+                next(self.job)
         except StopIteration as done:
             result: QueryResult = done.value._replace(fix_stamp_ns=self._begun_ns)
             self._cancel()

@@ -126,18 +126,13 @@ class Robot:
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
         self.building: Mapping[str, Floor] = {}  # by `Localizer.handle_building`
-        self._visited: dict[str, LoadedMap] = {}  # maps of its other sites
+        self.visited: dict[str, LoadedMap] = {}  # maps of its other sites
         self._site = ""  # whose map the last estimate is in
 
     @property
     def running(self) -> LoadedMap | None:
         """Return the map of the site where the robot is."""
-        return self._visited.get(self._site) if self._site else self.versions.running
-
-    @property
-    def visited_versions(self) -> dict[str, int]:
-        """Return the versions of the maps of the building's other sites."""
-        return {site: loaded.version for site, loaded in self._visited.items()}
+        return self.visited.get(self._site) if self._site else self.versions.running
 
     def use(self, loaded: LoadedMap) -> None:
         """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
@@ -154,10 +149,10 @@ class Robot:
         self._aligned = frame
         if building is not self.building:  # it changes less often than maps
             self.building = building
-            self._visited = {site: held for site, held in self._visited.items() if site in building}
+            self.visited = {site: held for site, held in self.visited.items() if site in building}
             self.localizer.handle_building(building)
         for loaded in maps:
-            self._visited[loaded.wanted.site] = loaded
+            self.visited[loaded.wanted.site] = loaded
             loaded.show(self.localizer, loaded.wanted.site)
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:

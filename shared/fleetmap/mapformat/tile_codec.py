@@ -49,26 +49,27 @@ def half_angle_value(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
 def direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
     """(N, 2) octahedral codes, about 2.9 degrees apart, of directions (N, 3). Source: Meyer et al. 2010."""
     # Twice, because directions on the folded edge of the octahedron have two codes: the second pass picks one.
-    return _direction_code(direction_value(_direction_code(directions)))
+    for _ in range(2):
+        vectors = directions.astype(np.float64)
+        vectors = vectors / np.abs(vectors).sum(axis=1, keepdims=True)
+        upper = vectors[:, :2]
+        plane = np.where(vectors[:, 2:] < 0, _folded(upper), upper)
+        steps = np.clip(np.round(plane * _DIRECTION_STEPS), -_DIRECTION_STEPS, _DIRECTION_STEPS)
+        codes = np.asarray(steps, np.int8)
+        directions = direction_value(codes)
+    return codes
 
 
-def _direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
-    vectors = directions.astype(np.float64)
-    vectors = vectors / np.abs(vectors).sum(axis=1, keepdims=True)
-    upper = vectors[:, :2]
-    signs = np.where(upper >= 0, 1.0, -1.0)
-    folded = (1.0 - np.abs(upper[:, ::-1])) * signs
-    plane = np.where(vectors[:, 2:] < 0, folded, upper)
-    return np.asarray(np.clip(np.round(plane * _DIRECTION_STEPS), -_DIRECTION_STEPS, _DIRECTION_STEPS), np.int8)
+def _folded(plane: Array) -> Array:
+    """The other half of the octahedron, folded outwards."""
+    return np.asarray((1.0 - np.abs(plane[:, ::-1])) * np.where(plane >= 0, 1.0, -1.0))
 
 
 def direction_value(codes: NDArray[np.int8]) -> NDArray[np.float32]:
     """(N, 3) unit directions of octahedral codes (N, 2)."""
     plane = np.clip(codes.astype(np.float64), -_DIRECTION_STEPS, _DIRECTION_STEPS) / _DIRECTION_STEPS
     z = 1.0 - np.abs(plane).sum(axis=1, keepdims=True)
-    signs = np.where(plane >= 0, 1.0, -1.0)
-    folded = (1.0 - np.abs(plane[:, ::-1])) * signs
-    vectors = np.concatenate([np.where(z < 0, folded, plane), z], axis=1)
+    vectors = np.concatenate([np.where(z < 0, _folded(plane), plane), z], axis=1)
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 
 

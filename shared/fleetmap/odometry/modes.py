@@ -547,9 +547,8 @@ class InertialMode(WindowMode):
     def _lacking_mps(self, seen: Array) -> Array:
         """Speed (3,) in the axes of `odom` that the state lacks for the motion since the last frame, cam_from_previous (4, 4)."""
         window = self.window
-        predicted = window.filter.cam_from_earlier(
-            window.filter.clone_ids[-1], self._rig.cam_from_body, self._rig.followed
-        )
+        predicted = window.cam_from_earlier(window.filter.clone_ids[-1])
+        assert predicted is not None
         since = self._body_from_next(predicted)
         off_m = self._body_from_next(seen)[:3, 3] - since[:3, 3]
         return np.asarray(window.filter.state.rotation @ since[:3, :3].T @ off_m / self._step_s)

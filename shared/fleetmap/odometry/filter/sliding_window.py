@@ -13,7 +13,6 @@ from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.rectification import MountedRig
 
 _UNKNOWN_DEPTH_M = 5.0
-_FAR_DEPTH_M = 20.0
 # The filter contradicts the images if it accepts less than this share of at least as many tracks over as many updates.
 _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
@@ -34,6 +33,8 @@ class OdometryRig:
 
 class SlidingWindow:
     """The state at stamp_ns (IMU clock), one clone for each frame that is kept, and the observations not used yet."""
+
+    first_depth_m: float | None = 20.0  # of a point without disparity; None: that of the scene
 
     def __init__(self, rig: OdometryRig, start: InitialState) -> None:
         self.rig, self.stamp_ns = rig, start.stamp_ns
@@ -122,11 +123,10 @@ class SlidingWindow:
         self._add_clone(frame_index)
         self._observe(frame_index, tracked)
         due = (frame_index + tracked.ids) % chunk_frames == 0
-        chosen = tracked.ids, due | tracked.by_descriptors, self._first_depth_m
+        chosen = tracked.ids, due | tracked.by_descriptors, self.first_depth_m or self.scene_depth_m
         seen, scale = self.matched_body(tracked), self.rig.settings.filter.descriptor_sigma_scale
-        used = (
-            self.filter.update(*chosen, iterations) if seen is None else self.filter.update(*chosen, 4, seen[1], scale)
-        )
+        effort = (iterations,) if seen is None else (4, seen[1], scale)
+        used = self.filter.update(*chosen, *effort)
         if (used == 1).any():
             self._refused_frames = 0
         elif self._refused_frames or (used == -1).any():
@@ -143,11 +143,6 @@ class SlidingWindow:
     def _add_clone(self, frame_index: int) -> None:
         self.filter.add_clone(frame_index, self.rate_body_radps)
         self._stamps_ns[frame_index] = self.stamp_ns
-
-    @property
-    def _first_depth_m(self) -> float:
-        """Initial depth of a point without disparity."""
-        return _FAR_DEPTH_M
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
         for earlier in tracked.earlier:

@@ -208,9 +208,8 @@ def dynamic_initialization(
 
     None if the alignment contradicts gravity's size.
     """
-    stamps = [int(stamp) for stamp in vision.stamps_ns]
-    rotations = vision.frame_from_body[:, :3, :3]
-    motion = VisualMotion(stamps, rotations, vision.positions_m, None, 0.004, 0.04, (200.0, 20.0))
+    stamps_ns, rotations = vision.stamps_ns.tolist(), vision.frame_from_body[:, :3, :3]
+    motion = VisualMotion(stamps_ns, rotations, vision.positions_m, None, 0.004, 0.04, (200.0, 20.0))
     found = align(motion, imu, noise, settings, gravity_slack=2.0, steps=4)
     return None if found is None else initial_state(vision, found)
 
@@ -226,12 +225,10 @@ def mono_inertial_initialization(
     vision holds vision_from_cam at IMU stamps. None if the motion does not determine the scale to within the settings' share, or
     if the fitted gravity is implausible.
     """
-    stamps = [int(stamp) for stamp in vision.stamps_ns]
     rotations = vision.frame_from_body[:, :3, :3] @ body_from_cam[:3, :3].T  # vision_from_body
     levers_m, weights = -rotations @ body_from_cam[:3, 3], (1 / _POSITION_SIGMA_M, 1 / _VELOCITY_SIGMA_MPS)
-    motion = VisualMotion(
-        stamps, rotations, levers_m, vision.positions_m, _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS, weights
-    )
+    sigmas = _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS
+    motion = VisualMotion(vision.stamps_ns.tolist(), rotations, levers_m, vision.positions_m, *sigmas, weights)
     found = align(motion, imu, noise, settings, gravity_slack=3.0, steps=5)
     if found is None:
         return None

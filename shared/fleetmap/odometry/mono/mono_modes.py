@@ -39,6 +39,8 @@ Ids = NDArray[np.int64]
 class MonocularWindow(SlidingWindow):
     """The window of one camera: depth comes from points triangulated from several frames."""
 
+    first_depth_m = None
+
     def __init__(self, rig: OdometryRig, start: InitialState) -> None:
         super().__init__(rig, start)
         self.is_blind = False  # its speed is not known well enough to place points by its way
@@ -80,10 +82,6 @@ class MonocularWindow(SlidingWindow):
         if self.is_blind:
             tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0], earlier=())
         return super().update(frame_index, tracked, chunk_frames, iterations)
-
-    @property
-    def _first_depth_m(self) -> float:
-        return self.scene_depth_m
 
     def _depth_of(self, pixels: Array) -> float:
         return self.scene_depth_m
@@ -152,7 +150,7 @@ class MonocularMode(Mode):
         """See Mode: none while the image stands still, of any scale. Else the gyro's turn, and a way of unknown direction and speed."""
         if self._still_from <= frame_index <= self._frame_index:
             sigma_rad = self._rig.settings.monocular.still_px / self._rig.camera.focal_px
-            sigmas = np.repeat([sigma_rad, sigma_rad * self._visual.depth], 3)
+            sigmas = np.repeat([sigma_rad, sigma_rad * self.visual_odometry.depth], 3)
             return np.eye(4), (self._frame_index - frame_index) * np.diag(sigmas**2)
         number = frame_index - self._frame_index - 1
         if self.imu is None or not self.is_in_map or -number > len(self._stamps_ns):
@@ -197,7 +195,7 @@ class MonocularMode(Mode):
             "odom_from_body": self._body(there),
             "cov_rot_trans": turn @ visual.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
             "status": status,
-            "scene_depth_m": visual.depth,
+            "scene_depth_m": self.visual_odometry.depth,
             "scale_known": False,
         }
 
@@ -260,7 +258,7 @@ class MonocularMode(Mode):
         After motion: all frames since vision began; after rest: those since the image stands still.
         """
         window = MonocularWindow(self._rig, start)
-        window.scene_depth_m = self._visual.depth * (1.0 if metres_per_unit is None else metres_per_unit)
+        window.scene_depth_m = self.visual_odometry.depth * (1.0 if metres_per_unit is None else metres_per_unit)
         mode = InertialMode(window, imu)
         mode.predict(self.stamp_ns)
         window.seed(frame_index, tracked)

@@ -36,14 +36,13 @@ class VisualEstimate:
     """Result of one frame: vision_from_cam, None before the first pair of keyframes and after lost tracking.
 
     cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are located only now, (frame index, vision_from_cam).
-    lost: this frame has no link to earlier ones, and `vision` restarts. depth: median along the optical axis.
+    lost: this frame has no link to earlier ones, and `vision` restarts.
     """
 
     vision_from_cam: Array | None
     cov_rot_trans: Array
     revised: tuple[tuple[int, Array], ...] = ()
     lost: bool = False
-    depth: float = 5.0
 
 
 @dataclass
@@ -65,7 +64,7 @@ class VisualOdometry:
         self._last = np.eye(4)  # vision_from_cam of the frame before
         self.step = np.eye(4)  # previous camera from this one
         self._covariance = np.zeros((6, 6))
-        self.depth = settings.first_depth
+        self.depth = settings.first_depth  # of the points, the median along the optical axis
 
     @property
     def started(self) -> bool:
@@ -85,7 +84,7 @@ class VisualOdometry:
         located = self._locate(frame)
         if located is None:
             self._map, self._waiting, self.step = _LocalMap(), [frame], np.eye(4)
-            return VisualEstimate(None, self._covariance, lost=True, depth=self.depth)
+            return VisualEstimate(None, self._covariance, lost=True)
         frame, cov = located
         self._place_new(frame)
         if self._is_new(frame):
@@ -110,13 +109,13 @@ class VisualOdometry:
         if (depths > 0).any():
             self.depth = float(np.median(depths[depths > 0]))
         earlier = tuple((frame.frame_index, frame.vision_from_cam) for frame in revised)
-        return VisualEstimate(vision_from_cam, self._covariance.copy(), earlier, depth=self.depth)
+        return VisualEstimate(vision_from_cam, self._covariance.copy(), earlier)
 
     # --- the first pair ---
 
     def _first_frames(self, frame: Frame) -> VisualEstimate:
         self._waiting.append(frame)
-        nothing = VisualEstimate(None, self._covariance, depth=self.depth)
+        nothing = VisualEstimate(None, self._covariance)
         while len(self._waiting) > 1:
             first = self._waiting[0]
             _, a, b = np.intersect1d(first.ids, frame.ids, return_indices=True)
