@@ -73,19 +73,15 @@ def _stereo_pixels(pixels: AnyArray, camera: StereoCamera) -> bool:
     return _within(pixels[:, :2], camera) and bool(np.all(is_column))
 
 
-_TRANSFORM, _COVARIANCE, _VECTOR = (
-    Kind("<f8", (4, 4), _rigid),
-    Kind("<f8", (6, 6), _covariance),
-    Kind("<f8", (3,), _finite),
-)
+_COVARIANCE = Kind("<f8", (6, 6), _covariance)
 _TRANSFORMS = (
     "body_from_cam base_from_body body_from_now odom_from_body previous_from_body new_odom_from_old_odom "
     "map_from_body map_from_base"
 )
 ARRAYS: Mapping[str, Kind] = {
-    **dict.fromkeys(_TRANSFORMS.split(), _TRANSFORM),
+    **dict.fromkeys(_TRANSFORMS.split(), Kind("<f8", (4, 4), _rigid)),
     **dict.fromkeys(("cov_rot_trans", "cov_bias_cam"), _COVARIANCE),
-    **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), _VECTOR),
+    **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), Kind("<f8", (3,), _finite)),
     "PositionPrior.cov_rot_trans": _COVARIANCE._replace(is_good=_prior_covariance),
     "Features.pixels": Kind("<f8", ("n", 2), _within),
     "Features.octaves": Kind("|i1", ("n",), lambda octaves, _: bool(np.all((octaves >= 0) & (octaves < 32)))),

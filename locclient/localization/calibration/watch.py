@@ -120,12 +120,12 @@ class CalibrationWatch:
 
     def handle_unmatched(self, query: FinishedQuery) -> None:
         """As `handle`, for a frame that matches the map only without its depth: measure the depth of the matched features."""
-        matched = None if query.fix is None else query.fix.matched
-        if query.fix is None or matched is None:
-            return
+        fix = query.fix
+        assert fix is not None and fix.matched is not None
+        matched = fix.matched
         found = stereo.disparities(query.frame, matched.camera, matched.pixels[:, :2], self._stereo)
         pixels = np.column_stack([matched.pixels[:, :2], matched.pixels[:, 0] - found[:, 0]])
-        self.handle(replace(query, fix=replace(query.fix, matched=replace(matched, pixels=pixels))))
+        self.handle(replace(query, fix=replace(fix, matched=replace(matched, pixels=pixels))))
 
     # --- looks --------------------------------------------------------------------------------------------------------
 
@@ -158,10 +158,8 @@ class CalibrationWatch:
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
         if turned is not None and abs(turned[0]) > _KNOCKED_RAD:
             turned = None
-        for at_one, measurement in (
-            (HEADING, turned),
-            (HEIGHT, mounting.height(base, query.relocalizer.view.points_map)),
-        ):
+        height = mounting.height(base, query.relocalizer.view.points_map)
+        for at_one, measurement in ((HEADING, turned), (HEIGHT, height)):
             if measurement is not None:
                 value, sigma = measurement
                 information[at_one, at_one] += sigma**-2

@@ -158,10 +158,8 @@ def _type_name(message: type) -> str:
 
 def _unconnected(node: Node) -> Iterator[str]:
     """Which publishers and subscriptions ROS 2 does not connect with the node's: both sides of each, and the reason."""
-    own, looks = (
-        node.get_fully_qualified_name(),
-        (node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic),
-    )
+    own = node.get_fully_qualified_name()
+    looks = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
     for topic in sorted({each.topic for each in (*node.publishers, *node.subscriptions)}):
         sides = [[(f"{end.node_namespace.rstrip('/')}/{end.node_name}", end) for end in look(topic)] for look in looks]
         for (writer, offered), (reader, wanted) in product(*sides):

@@ -291,14 +291,8 @@ def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -
     # the accelerometer's bias along gravity shows in its size; across gravity it hides in the tilt
     accel_bias = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * (force / np.linalg.norm(force))
     state = NavState(rotation, gyro_bias_radps=window.gyro_radps.mean(axis=0), accel_bias_mps2=accel_bias)
-    velocity, gyro, accel = (
-        sigma**2
-        for sigma in (
-            settings.initial_velocity_sigma_mps,
-            settings.initial_gyro_bias_sigma_radps,
-            settings.initial_accel_bias_sigma_mps2,
-        )
-    )
+    velocity, gyro = settings.initial_velocity_sigma_mps**2, settings.initial_gyro_bias_sigma_radps**2
+    accel = settings.initial_accel_bias_sigma_mps2**2
     covariance = np.diag([0.0] * 3 + [velocity] * 3 + [1e-8] * 3 + [gyro] * 3 + [accel] * 3)
     # tilt and bias errors are one: R (a_m - ba) must keep pointing up, so r_xy follows from R dba
     tilt_from_force = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) / GRAVITY_MPS2
