@@ -10,7 +10,7 @@ from typing import NamedTuple
 from fleetmap.errors import StateError
 from mapserver.api.people_routes import enrolled_of, operators_of
 from mapserver.dashboard.console import PageContext, Services, number
-from mapserver.dashboard.live import ORDER, LiveRobot
+from mapserver.dashboard.live import ORDER, LiveRobot, counted
 from mapserver.dashboard.rendering import size
 from mapserver.fleet.alerts import active_alerts
 from mapserver.operators.operators import MAX_TOKEN_DAYS
@@ -141,7 +141,7 @@ def people(services: Services, context: PageContext) -> dict[str, object]:
         "name_pattern": OPERATOR_PATTERN.strip("^$").replace("+-", r"+\-"),
         "most_days": MAX_TOKEN_DAYS,
         "left": lambda token: (token.ends_ns - now_ns) / 1e9,
-        "robots": sorted(robots, key=lambda robot: (ORDER[robot.tone], robot.name)),
+        "robots": sorted(robots, key=lambda robot: (ORDER[robot.tone], counted(robot.name))),
         "most": _MOST_ROBOTS,
         "cannot_enrol": cannot_enrol(RobotRegister(store)),
     }

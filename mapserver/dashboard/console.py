@@ -252,7 +252,8 @@ class Console:
             elif not page.of_site:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
-                site = await load(self.services.maps.chosen_site, site)
+                lost = await load(self.services.robots.lost) if site is None else ()
+                site = await load(self.services.maps.chosen_site, next((one for one in lost if one in stored), site))
             known = ("site", "find", *RANGE, *page.knows)
             if unknown := [name for name in request.query_params if name not in known]:
                 names = ", ".join(known)

@@ -2,12 +2,13 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from fleetmap.messages import Status
-from mapserver.dashboard.data import MANY_SITES, Kept
+from mapserver.dashboard.data import Kept
 from mapserver.dashboard.map_layers import Mark
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure, calibration_figures
@@ -108,19 +109,25 @@ class LiveRobots:
     """Reads the fleet at most about once a second, for any number of pages."""
 
     def __init__(self, fleet: Fleet, clock_s: Callable[[], float]) -> None:
-        self.fleet, self._sites = fleet, Kept[LiveSite](MANY_SITES, _CACHED_S, clock_s)
+        self.fleet, self._all = fleet, Kept[LiveSite](1, _CACHED_S, clock_s)
 
     def look(self, site: str) -> LiveSite:
         """The site's robots as of now."""
+        return LiveSite(tuple(robot for robot in self._look().robots if robot.status.site == site))
 
+    def lost(self) -> dict[str, int]:
+        """How many robots of each site are not localised; the site with most of them first, none without."""
+        return dict(Counter(robot.status.site for robot in self._look().robots if robot.tone == "bad").most_common())
+
+    def _look(self) -> LiveSite:
         def read() -> LiveSite:
-            robots = map(live_robot, self.fleet.robots(site))
-            return LiveSite(tuple(sorted(robots, key=lambda one: (ORDER.get(one.tone, 1), _counted(one.name)))))
+            robots = map(live_robot, self.fleet.robots())
+            return LiveSite(tuple(sorted(robots, key=lambda one: (ORDER.get(one.tone, 1), counted(one.name)))))
 
-        return self._sites.get(site, read)
+        return self._all.get("", read)
 
 
-def _counted(name: str) -> list[str | int]:
+def counted(name: str) -> list[str | int]:
     """A key by which tug-9 is before tug-10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 

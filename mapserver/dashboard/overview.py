@@ -58,8 +58,7 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
     areas = services.maps.store.areas(context.site)
     levels, (floors, guests) = services.maps.levels(context.site), _floors(services, context)
     week_ns = health.week_since_ns
-    alerts = [one for one in with_acts(services.maps.store, health.alerts) if one.state != "closed"]
-    own = {one.about: one for one in sorted(alerts, key=lambda one: one.state == "open") if one.name not in _ALERTS}
+    alerts, own = alerts_of(services, health)
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
@@ -72,6 +71,13 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
         "marks": _marks(context, live),
         "floors": floors,
     }
+
+
+def alerts_of(services: Services, health: SiteHealth) -> tuple[list[Incident], dict[str, Incident]]:
+    """All alerts that are not closed; those of robots by their names, an open one before others."""
+    alerts = [one for one in with_acts(services.maps.store, health.alerts) if one.state != "closed"]
+    own = {one.about: one for one in sorted(alerts, key=lambda one: one.state == "open") if one.name not in _ALERTS}
+    return alerts, own
 
 
 def _floors(services: Services, context: PageContext) -> tuple[list[Choice], list[dict[str, object]]]:
@@ -99,7 +105,7 @@ def site_line(live: LiveSite) -> Sentence:
     online = [robot for robot in live.robots if robot.tone != "quiet"]
     lost, unsure = live.count("bad"), live.count("warn")
     if not live.robots:
-        return Sentence("quiet", "No robot has reported yet; locclient run on a robot does.")
+        return Sentence("quiet", "No robot of this site has reported yet; locclient run on a robot does.")
     if not online:
         last_s = min(robot.status.seconds_since for robot in live.robots)
         return Sentence("quiet", f"All robots are offline; the last one reported {age(last_s)} ago.")
@@ -123,7 +129,7 @@ def _troubles(robot: LiveRobot) -> list[str]:
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
     if robot.status.is_copied:
         found.append("is there twice: has another robot its name, or was its certificate copied?")
-    found += [dropped_words(robot.metrics)] if Flag.OVERLOADED in robot.flags else []
+    found += [dropped_words(robot.metrics).partition(";")[0]] if Flag.OVERLOADED in robot.flags else []
     if robot.is_behind and robot.status.wanted_version is not None:
         found.append(f"runs version {robot.status.version or 'none'}, should run {robot.status.wanted_version}")
     if robot.status.clock_ahead_s is not None and abs(robot.status.clock_ahead_s) >= 1:
@@ -186,7 +192,7 @@ def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
 def _figures(live: LiveSite, health: SiteHealth) -> list[Figure]:
     """Those that are known: what cannot be known yet is left out."""
     online, failures = len(live.robots) - live.count("quiet"), health.day.failures
-    found = [Figure("Online", f"{online} of {len(live.robots)}", "")]
+    found = [Figure("Online", f"{online} of {len(live.robots)}", "")] if live.robots else []
     if shown := share(health.day.localised_share_of_all):
         found.append(Figure("Localised while driving, 24 h", shown, ""))
     if failures.low is not None:
@@ -202,6 +208,10 @@ def _notices(services: Services, context: PageContext, health: SiteHealth, alert
     def told(tone: str, words: str, page: str, incident: Incident | None = None) -> None:
         found.append(Notice(tone, words, context.to(page), begun(page), incident))
 
+    for other, count in services.robots.lost().items():
+        if other != site:
+            to, more = context.to("", site=other), f"Overview of {other}"
+            found.append(Notice("bad", f"Robots of {other} that are not localised: {count}.", to, more))
     for one in (one for one in alerts if one.name in _ALERTS):
         words = f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}"
         told("bad" if one.state == "open" else "quiet", words, _ALERTS[one.name], one)

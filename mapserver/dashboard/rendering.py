@@ -1,10 +1,11 @@
 """The templates of all pages, in `templates/`: what they are given is escaped, and a name that is not given is an error."""
 
+import re
 from pathlib import Path
 from urllib.parse import urlencode
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from fleetmap.encoding import to_json
 from mapserver.api.operations import OPERATIONS
@@ -49,12 +50,14 @@ def script_json(value: object) -> Markup:
     return Markup(text.translate({ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&'"}))
 
 
+_CODE = re.compile("`([^`]+)`")  # what is to be typed
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")
 TEMPLATES = Environment(loader=_LOADER, autoescape=True, undefined=StrictUndefined)
 TEMPLATES.globals["operations"] = OPERATIONS
 TEMPLATES.filters |= {
     "script_json": script_json,
     "age": age,
+    "coded": lambda words: Markup(_CODE.sub(r"<code>\1</code>", str(escape(words)))),
     "size": size,
     "share": share,
     "rate": format_rate,

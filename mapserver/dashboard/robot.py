@@ -16,7 +16,7 @@ from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.fleet_parts import Sentence
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
 from mapserver.dashboard.map_layers import Layer, Line
-from mapserver.dashboard.overview import remarks, since_words
+from mapserver.dashboard.overview import alerts_of, remarks, since_words
 from mapserver.fleet_statistics.kpis import hour_of
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter, TraceRow
@@ -187,6 +187,7 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
     failures = services.maps.store.fleet.failures(wanted, limit=FAILURES_SHOWN)
     within = [row for row in failures if since_ns <= row.happened_ns < until_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
+    enrolled = services.maps.store.log(site=context.site, kind="robot enrolled")
     version = live.status.version or services.maps.current_version(context.site)
     trail = way(rows, shown, ingest.trace_every_s)
     layers = [
@@ -213,6 +214,7 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
         "within": within,
         "tone_of": tone_of,
         "cameras": [(PARAMETERS[figure.name], figure.words) for figure in live.calibration],
+        "enrolled": next((line for line in enrolled if line.detail == robot), None),
         "drifts": [PARAMETERS[figure.name] for figure in live.calibration if figure.is_drifted],
     }
 
@@ -221,7 +223,7 @@ def now(services: Services, context: PageContext, robot: str) -> dict[str, objec
     """What changes from second to second."""
     live = services.robots.look(context.site).robot(robot)
     if live is None:
-        return {"line": Sentence("quiet", "It is not known any more."), "facts": [], "marks": []}
+        return {"line": Sentence("quiet", "It is not known any more."), "facts": [], "marks": [], "incident": None}
     where = live.where(services.maps.store.areas(context.site), services.maps.levels(context.site))
     state, (since, exact) = live.words.capitalize(), since_words(context, live)
     if live.tone == "quiet":
@@ -234,7 +236,8 @@ def now(services: Services, context: PageContext, robot: str) -> dict[str, objec
     told = [live.words] if is_offline else [*live.flags, live.words]
     advice = next((_ADVICE[name] for name in told if name in _ADVICE), "")
     line = Sentence(live.tone, words, exact and f"since {exact}", advice)
-    return {"line": line, "facts": _facts(live), "marks": live.marks()}
+    _, alerts = alerts_of(services, services.health.site(context.site))
+    return {"line": line, "facts": _facts(live), "marks": live.marks(), "incident": alerts.get(robot)}
 
 
 def _facts(robot: LiveRobot) -> list[tuple[str, str]]:
@@ -250,6 +253,6 @@ def _facts(robot: LiveRobot) -> list[tuple[str, str]]:
             if isinstance(value := robot.metrics.get(name), int | float)
         ),
         ("Cameras", str(robot.metrics.get("views") or "")),
-        ("Clock against the server's", "" if clock_s is None else f"{clock_s:+.2f} s"),
+        ("Clock against the server's", "" if clock_s is None else f"{clock_s:+z.2f} s"),
     ]
     return [(words, value) for words, value in found if value]

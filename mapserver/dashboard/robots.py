@@ -10,6 +10,7 @@ from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Choice
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.overview import remarks, since_words, site_line
+from mapserver.dashboard.rendering import share
 from mapserver.floor_plan.areas import Areas
 from mapserver.trust.enrolment import RobotRegister
 
@@ -21,6 +22,7 @@ _COLUMNS = {
     "map": "Map version",
     "cpu": "CPU of a frame",
     "failures": "Failures, 24 h",
+    "dropped": "Drops, 24 h",
 }
 
 
@@ -74,5 +76,6 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Area
         "map": "none" if robot.status.version is None else str(robot.status.version),
         "cpu": f"{cpu_ms:.1f} ms" if isinstance(cpu_ms, int | float) else "",
         "failures": "0" if own is None else str(own.failures.events + own.failures_running),
+        "dropped": (own and share(own.frame_drop_share)) or "",
     }
     return robot, cells, exact

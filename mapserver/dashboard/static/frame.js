@@ -6,4 +6,9 @@ document.getElementById("theme").addEventListener("change", ({ target }) => {
   const themes = { dark: "body--dark", light: "" };
   document.body.className = `console ${themes[target.value] ?? "print"}`;
 });
+for (const kind of ["click", "keydown"])
+  document.addEventListener(kind, ({ target, key }) => {
+    const range = document.querySelector(".range[open]");
+    if (range && (key ? key === "Escape" : !range.contains(target))) range.open = false;
+  });
 document.querySelector("header select[name=site]").addEventListener("change", ({ target }) => target.form.submit());

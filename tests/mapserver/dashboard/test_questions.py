@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 
 import pytest
 from playwright.sync_api import Locator, Page, expect
@@ -15,7 +15,7 @@ from mapserver.store import Actor, MapStore
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking
 from support.pages.browser import Chromium, box_of
-from support.storage.operator_scene import WORSE, fill_shift
+from support.storage.operator_scene import WORSE, fill_shift, yesterday
 
 MOST_CLICKS = 2
 
@@ -94,6 +94,8 @@ def test_which_robots_need_a_person_now(operator: Operator) -> None:
         expect(rows.nth(n)).to_have_text(re.compile(told))
         expect(rows.nth(n).locator(".since")).to_have_attribute("title", re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d"))
         assert box_of(rows.nth(n))["y"] < 700, "the answer is in sight"
+    operator.page.get_by_label("Find a robot").fill("tug-19")
+    expect(rows.filter(visible=True)).to_have_count(1)
     assert operator.clicks == 0
 
 
@@ -138,6 +140,13 @@ def test_what_happened_last(operator: Operator) -> None:
     moments = [datetime.fromisoformat(when[:19]) for when in listed.evaluate_all("all => all.map(one => one.title)")]
     assert len(moments) > 5
     assert moments == sorted(moments, reverse=True)
+    operator.begin()  # and what happened between 14:00 and 15:00
+    operator.go("Failures")
+    operator.click(page.locator(".range summary"))
+    for end, hour in (("From", 14), ("Until", 15)):
+        page.get_by_label(end).fill(f"{datetime.fromtimestamp(yesterday(hour, 0) / 1e9, UTC):%Y-%m-%dT%H:%M}")
+    page.keyboard.press("Enter")
+    expect(page.locator("#answer")).to_have_text("1 failure.")
 
 
 def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
@@ -199,7 +208,8 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
             "#endings tr",
             r"Certificate of the server for robots.*\d+ days",
         ),
-        ("who enrolled this robot", ["Administration", "People and robots"], "#of-tug-7", r"by ada, \d+ \S+ ago"),
+        ("who enrolled this robot", ["Robots", "tug-7"], "main p", r"Enrolled by ada, \d+ \S+ ago"),
+        ("which robots had drops", ["Robots"], "#rows tr", r"^tug-3.*2\.0 %$"),
         ("who did that", ["Administration", "Log"], "#lines tr", r"ada.*robot enrolled: tug-7.*a new robot"),
     ):
         operator.begin()

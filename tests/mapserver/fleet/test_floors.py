@@ -139,6 +139,10 @@ def test_pages_lead_to_the_other_floors_and_list_robots_where_they_are(house: Pa
         assert eventually(lambda: 'href="/dashboard/robots/r1?site=hall-1">r1 of hall-1</a>' in shown("?site=hall-2"))
         assert ">L2 (1)</a>" in shown("?site=hall-2")
         assert ">on the floor L2</span>" in shown("?site=hall-1")
+        lost = replace(health, site="yard", status="LOST", metrics={})
+        bus.publish(robot_key("yard", "r1", "health"), encode_message(lost))
+        assert eventually(lambda: "Overview of yard</h1>" in shown(""), 20.0), "where somebody is needed"
+        assert "Robots of yard that are not localised: 1." in shown("?site=hall-2")
 
 
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:

@@ -79,6 +79,7 @@ def _weeks(now_ns: int) -> FleetBatch:
             counts = Counters(
                 reports=1200, observed_ms=driven_ms, driving_ms=driven_ms, judged_ms=driven_ms, usable_ms=driven_ms,
                 found_ms=driven_ms - failures * 20_000, failures=failures, blind_failures=failures, blind_seen=failures,
+                frames=72_000, frames_dropped=1440 * (back % 8 == 3),
             )  # fmt: skip
             for axis, key in (("area", name), ("site", ""), ("robot", f"tug-{back % 8}"), ("version", "2")):
                 batch.add(SITE, axis, key, hour - back, counts)
