@@ -138,11 +138,6 @@ class PageContext:
         return f"{self.root}/plans/{self.site}/{version}.png"
 
 
-def no_sites(_: str | None) -> list[str]:
-    """For pages of sites that have a version, jobs or an inbox."""
-    return []
-
-
 class Page(NamedTuple):
     """A page. fill: what its template needs beside `context`, of the services, it and the parts of its path in braces; may block.
 
@@ -158,7 +153,7 @@ class Page(NamedTuple):
     under: str = ""
     knows: Sequence[str] = ()
     usual: str = ""
-    under_way: Callable[[str | None], list[str]] = no_sites
+    under_way: Callable[[str | None], list[str]] = lambda _: []
     of_site: bool = True
 
 
@@ -205,7 +200,7 @@ class Console:
         one: Callable[..., dict[str, Any]],
         *,
         shows: Sequence[str] = (),
-        under_way: Callable[[str | None], list[str]] = no_sites,
+        under_way: Callable[[str | None], list[str]] = lambda _: [],
     ) -> None:
         """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts.
 

@@ -122,14 +122,14 @@ def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock
 
 
 def first_looks(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
-    """Moments to look at first, by number: a second before the beginning, at it, and where the robot was found again."""
+    """Moments to look at first, in ms after the first: a second before the beginning, at it, and where the robot was found again."""
     if not moments:
         return {}
     blind = blind_time(moments, began_ns)
     found_ns = None if blind is None else blind.found_ns
     wanted = {"A second before": began_ns - 10**9, "As it began": began_ns, "Found again": found_ns}
     return {
-        name: min(range(len(moments)), key=lambda n: abs(moments[n].stamp_ns - stamp_ns))
+        name: _after_ms(moments, min((each.stamp_ns for each in moments), key=lambda ns: abs(ns - stamp_ns)))
         for name, stamp_ns in wanted.items()
         if stamp_ns is not None
     }
@@ -218,7 +218,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "clock": clock,
         "views": services.shown("failure", context, row, report),
         "seconds": {"instants": instants(moments, recorded, clock), "pictures": pictures},
-        "steps": {name: _after_ms(moments, moments[n].stamp_ns) for name, n in first_looks(moments, began_ns).items()},
+        "steps": first_looks(moments, began_ns),
         "scene": _scene(services, context, row, report, believed_path(moments, clock)),
         "nearby": near[:_LISTED],
         "held": (incidents := held(services, [row, *near[:_LISTED]])),

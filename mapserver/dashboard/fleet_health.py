@@ -9,7 +9,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
 from mapserver.dashboard.data import MANY_SITES, Kept
-from mapserver.dashboard.fleet_parts import Trial, trial_of
+from mapserver.dashboard.fleet_parts import Trial
 from mapserver.fleet.alerts import Incident
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
@@ -123,7 +123,7 @@ class HealthData:
             _TRENDS[area_trends({"": days[-1]}, {"": week})[0].verdict],
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for robot, counts in robots.items()},
-            tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
+            tuple((row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self.area_trends(site, None, None)),
             (next_hour - WEEK_H) * HOUR_NS,

@@ -77,13 +77,8 @@ class Bars(NamedTuple):
         return next((step for step in steps if step >= wanted), wanted)
 
 
-class Trial(NamedTuple):
-    """A version that some robots try, or tried in the last days, what is known about it so far, and how often both sides failed."""
-
-    canary: CanaryRow
-    finding: str
-    tried: Rate
-    others: Rate
+Trial = tuple[CanaryRow, CanaryFinding]
+"""A version that some robots try, or tried in the last days, and what is known about it so far."""
 
 
 def bar_edges(first_ns: int, end_ns: int, zone: tzinfo | None, least_ns: int = 0) -> tuple[list[int], str]:
@@ -91,11 +86,6 @@ def bar_edges(first_ns: int, end_ns: int, zone: tzinfo | None, least_ns: int = 0
     wide = (step_ns for step_ns in _STEPS_NS if step_ns >= least_ns and (end_ns - first_ns) / step_ns < _BARS)
     step_ns = next(wide, max(_STEPS_NS))
     return steps(first_ns, end_ns, step_ns, zone), _STEPS_NS[step_ns]
-
-
-def trial_of(canary: CanaryRow, found: CanaryFinding) -> Trial:
-    """A trial as pages show it; the outcome of one that has ended stays what it was."""
-    return Trial(canary, canary.outcome or found.reason, found.canary, found.others)
 
 
 def rate_figure(name: str, found: Rate, more: str) -> Figure:
@@ -119,7 +109,8 @@ def localised_figure(name: str, found: Kpis) -> Figure:
 
 def trial_words(trial: Trial, moment: Callable[[int | None], str | None]) -> tuple[str, str, str]:
     """Tone, what became of a trial, and what was found, empty before. moment: a stamp as people read it."""
-    canary, finding = trial.canary, trial.finding
+    canary, found = trial
+    finding = canary.outcome or found.reason  # what became of one that has ended stays
     tone, sentence = _TRIAL_WORDS[canary.state]
     when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
     words = f"Version {canary.version} {sentence.format(share=share(canary.share), when=when)}."
@@ -131,12 +122,14 @@ def trials_shown(
 ) -> list[tuple[str, str, str, Bars | None]]:
     """Of each trial the words, and the rates of both sides once they tell something."""
     shown = []
-    for trial in found:
-        version, sides = trial.canary.version, (trial.tried, trial.others)
-        labels = f"version {version}", f"others, version {trial.canary.base_version}"
-        name = f"Failures per robot-day with version {version} and with the others"
+    for canary, finding in found:
+        sides = (finding.canary, finding.others)
+        labels = f"version {canary.version}", f"others, version {canary.base_version}"
+        name = f"Failures per robot-day with version {canary.version} and with the others"
         drawn = Bars(name, [rate_bar(*side) for side in zip(labels, sides, strict=True)])
-        shown.append((*trial_words(trial, moment), drawn if any(side.low is not None for side in sides) else None))
+        shown.append(
+            (*trial_words((canary, finding), moment), drawn if any(side.low is not None for side in sides) else None)
+        )
     return shown
 
 

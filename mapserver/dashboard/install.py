@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
-from urllib.parse import parse_qs
+from urllib.parse import parse_qsl
 
 from anyio import to_thread
 from fastapi import FastAPI, Request, Response
@@ -149,9 +149,7 @@ def install_sign_in(app: FastAPI, settings: GuardSettings) -> None:
     @app.post(SIGN_IN, include_in_schema=False)
     async def sign_in(request: Request) -> Response:
         """Begins a session."""
-        given = {
-            name: values[0] for name, values in parse_qs((await request.body()).decode("utf-8", "replace")).items()
-        }
+        given = dict(parse_qsl((await request.body()).decode("utf-8", "replace")))
         then, name, operators = given.get("next", "/"), given.get("name", "").strip().lower(), settings.operators
         if operators is None:
             return RedirectResponse(_local(then), 303)

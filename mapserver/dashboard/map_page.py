@@ -137,8 +137,8 @@ def _used(services: Services, rows: SiteReleases) -> str:
     used = f"Robots should use version {rows.current.version}."
     if rows.canary is None:
         return used
-    trials = services.health.site(rows.site).trials
-    said = next((f": {trial.finding}" for trial in trials if trial.finding and trial.canary.id == rows.canary.id), "")
+    reasons = {trial.id: found.reason for trial, found in services.health.site(rows.site).trials}
+    said = f": {reasons[rows.canary.id]}" if rows.canary.id in reasons else ""
     return f"{used} Version {rows.canary.version} is tried by {share(rows.canary.share)} of them{said}."
 
 

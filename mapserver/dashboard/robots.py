@@ -26,10 +26,6 @@ _COLUMNS = {
 }
 
 
-Row = tuple[LiveRobot, dict[str, str], str]
-"""A robot, its words by column, and the moment of `since`."""
-
-
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
@@ -65,7 +61,10 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     }
 
 
-def _row(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas, levels: Mapping[str, str]) -> Row:
+def _row(
+    context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas, levels: Mapping[str, str]
+) -> tuple[LiveRobot, dict[str, str], str]:
+    """A robot, its words by column, and the moment of `since`."""
     own, cpu_ms = health.robots.get(robot.name), robot.metrics.get("frame_ms_mean")
     since, exact = since_words(context, robot)
     cells = {

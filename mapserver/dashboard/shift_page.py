@@ -28,7 +28,7 @@ def html_page(store: MapStore, site: str, hours: int, now_ns: int, config: Mapse
     current, until, step = store.current(site), hour_of(now_ns) + 1, -(-hours // _BARS)
     since, wanted = until - hours, FailureFilter(site=site, since_ns=(until - hours) * HOUR_NS)
     total = _total(store, site, since, until)
-    trials = (fleet_parts.trial_of(row, find(store, row, config.canary, now_ns)) for row in store.canaries(site)[:1])
+    trials = ((row, find(store, row, config.canary, now_ns)) for row in store.canaries(site)[:1])
     return TEMPLATES.get_template("shift.html").render(
         site=site,
         until_ns=now_ns,

@@ -100,7 +100,7 @@ def test_moments_and_pictures_of_another_time_are_left_out() -> None:
     far = PictureRow(9, "replay", 1 << 61, 10)
     near = [PictureRow(n, "replay", BEGAN_NS + k * 10**8, 10) for n, k in enumerate((-50, -9, -2, 4, 19, 23))]
     assert story.pictures_near([far, *near[::-1]], BEGAN_NS) == near
-    assert story.first_looks(CARRIED, BEGAN_NS) == {"A second before": 40, "As it began": 50, "Found again": 69}
+    assert story.first_looks(CARRIED, BEGAN_NS) == {"A second before": 4000, "As it began": 5000, "Found again": 6900}
     assert list(story.first_looks(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
 
 

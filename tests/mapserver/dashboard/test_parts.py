@@ -29,7 +29,7 @@ from mapserver.dashboard.plan import make_plan
 from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.dashboard.robot import band, curve, stretches, way
 from mapserver.fleet.fleet import Fleet, RobotStatus
-from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.canary_decision import CanaryFinding, CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, rate
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
@@ -284,8 +284,8 @@ def test_both_rates_of_a_trial_are_drawn_once_they_tell_something(store: MapStor
     canary = releases.start_canary(store, SITE, 3, 0.5)
 
     def shown(tried: tuple[int, float], others: tuple[int, float]) -> fleet_parts.Bars | None:
-        trial = fleet_parts.Trial(canary, "it is early", rate(*tried), rate(*others))
-        ((*_, sides),) = fleet_parts.trials_shown([trial], str)
+        found = CanaryFinding("wait", "it is early", rate(*tried), rate(*others), 0.0, 0.0)
+        ((*_, sides),) = fleet_parts.trials_shown([(canary, found)], str)
         return sides
 
     assert shown((0, 0.001), (0, 0.001)) is None

@@ -181,17 +181,12 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
         ("what needs me now", [], "#notices p", r"The night of hall failed \(job \d+\): it was interrupted\. Surveys"),
         ("what needs me now", [], "#notices p", r"Draft 3 is not published\. .* Map"),
         ("is it one robot or one place", ["Failures"], "#answer", failures),
-        (
-            "who published last and why",
-            ["Map"],
-            "#versions",
-            r"Version 2\s*current[^V]*Published by ada .* ago: the nightly map",
-        ),
+        ("who published last and why", ["Map"], "#versions", r"2\s*current[^V]*by ada .* ago: the nightly map"),
         (
             "is the canary good",
             [],
             "#notices",
-            r"Version 1 is tried by 20.0 % of the robots .*No decision before robots drive with it",
+            r"Version 1 is tried by 20.0 % .*No decision before robots drive with it",
         ),
         ("what is being built", ["Surveys"], "#jobs", r"build\s*running[^J]*matching: 30 of 120, about 3 min more"),
         (
@@ -202,12 +197,7 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
         ),
         ("where must I survey again", ["Surveys", "Where to survey again"], "#again ~ .scroll tr", "bob asked for it"),
         ("is the disk filling", ["Administration"], "#disk", r"GB of .* GB are free: enough"),
-        (
-            "when do certificates end",
-            ["Administration"],
-            "#endings tr",
-            r"Certificate of the server for robots.*\d+ days",
-        ),
+        ("when do certificates end", ["Administration"], "#endings tr", r"of the server for robots.*\d+ days"),
         ("who enrolled this robot", ["Robots", "tug-7"], "main p", r"Enrolled by ada, \d+ \S+ ago"),
         ("which robots had drops", ["Robots"], "#rows tr", r"^tug-3.*2\.0 %$"),
         ("who did that", ["Administration", "Log"], "#lines tr", r"ada.*robot enrolled: tug-7.*a new robot"),
