@@ -12,12 +12,15 @@ import mapserver
 from mapserver.store import MapStore
 from mapserver.store.places import Places, write_places
 from support.command_line import status as status_of
-from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
+from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking, watch
+from support.fleet.served_world import World, served_world
 from support.pages.browser import Chromium, running_chromium
+from support.recordings.recording_samples import write_mcap
 from support.storage.clock import Clock
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
 from support.waiting import eventually
+from support.worlds.box_room import there_and_back
 
 HAS_REMOTE = (Path(mapserver.__path__[0]) / "plugins" / "remote_stores").is_dir()
 expect.set_options(timeout=30_000)  # a busy machine answers late
@@ -46,6 +49,19 @@ def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
     """A new store, whose time is the clock's."""
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
         yield opened
+
+
+@pytest.fixture(scope="session")
+def room_ride(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of six seconds along a wall of the room, and back."""
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "ride", there_and_back())
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    """A server and a robot of it, on the bus in memory."""
+    with served_world(tmp_path) as made:
+        yield made
 
 
 @pytest.fixture(scope="session")
@@ -110,8 +126,12 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 @pytest.fixture
 def page(browser: Chromium) -> Iterator[Page]:
-    with browser.context(viewport={"width": 1280, "height": 900}) as context:
-        yield context.new_page()
+    """A page that asks one server alone and has no faults, but for those that its test expects and clears."""
+    with browser.context(ignore_https_errors=True, viewport={"width": 1280, "height": 900}) as context:
+        seen = watch(made := context.new_page())
+        yield made
+        assert seen.faults == []
+        assert len(seen.servers()) == 1
 
 
 @pytest.fixture

@@ -16,13 +16,8 @@ def test_pictures_show_the_pages(tmp_path: Path) -> None:
     chromium()
     fill_store(tmp_path)
     with serving(tmp_path) as served:
-        done = subprocess.run(
-            [SCRIPT, served.http, tmp_path, "hall", "overview", "map"],
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=90,
-        )
+        command = [SCRIPT, served.http, tmp_path, "hall", "overview", "map"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=90)
     assert (done.returncode, done.stdout.count("picture of the dashboard")) == (0, 2), done
     for page in ("overview", "map"):
         picture = cv2.imread(str(tmp_path / f"dashboard-{page}.png"), cv2.IMREAD_GRAYSCALE)

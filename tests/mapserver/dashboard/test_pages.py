@@ -29,6 +29,7 @@ from support.fleet.dashboard_scene import (
     serving,
     talking,
     wait_until,
+    watch,
 )
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
@@ -56,9 +57,7 @@ def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page
         expect(page.locator("h1")).to_have_text(title)
         assert_whole(page)
         page.wait_for_timeout(500)  # for what asks late; the browser's own "networkidle" does not always come
-        assert seen.faults == []
-        assert len(seen.requests) > 3
-        assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+    assert len(seen.requests) > 3 * len(PAGES)
 
 
 def test_every_link_to_a_document_leads_to_its_section(served: Served) -> None:
@@ -76,7 +75,7 @@ def test_every_link_to_a_document_leads_to_its_section(served: Served) -> None:
 
 def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> None:
     with talking(served.zenoh, ROBOTS) as moved:
-        seen = opened(page, served, "")
+        opened(page, served, "")
         expect(page.locator("#figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
         assert len(marks(page, ROBOTS)) == ROBOTS
         assert page.locator(".site-map *").count() < ROBOTS / 3, "robots are painted: they cost no elements"
@@ -103,13 +102,12 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         row = page.locator("#robots li", has=page.get_by_role("link", name="tug-4", exact=True))
         expect(row).to_contain_text("lost", timeout=15_000)
         assert page.evaluate("performance.timeOrigin") == before, "the page changed by itself, it was not loaded again"
-        assert seen.faults == []
 
 
 def test_robots_are_filtered_and_columns_chosen_by_the_address(page: Page, served: Served) -> None:
     with talking(served.zenoh, ROBOTS) as moved:
         moved["tug-4"] = (40.0, 14.0)
-        seen = opened(page, served, "robots")
+        opened(page, served, "robots")
         table = page.get_by_role("table", name="Robots, problems first")
         rows = table.locator("tbody tr").filter(visible=True)
         expect(rows).to_have_count(ROBOTS)
@@ -148,7 +146,6 @@ def test_robots_are_filtered_and_columns_chosen_by_the_address(page: Page, serve
         row = rows.filter(has=page.get_by_role("link", name="tug-9", exact=True))
         row.locator(".where").click(force=True)  # all of the row is the link, which covers it
         expect(page.locator("h1")).to_have_text("tug-9")
-        assert seen.faults == []
 
 
 def natural(name: str) -> int:
@@ -172,7 +169,7 @@ PLACE_OF = """name => {
 
 
 def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) -> None:
-    seen = opened(page, served, "")
+    opened(page, served, "")
     for _ in range(3):  # until no other robot is within the pointer's reach
         page.get_by_role("button", name="Zoom in").click()
     box = box_of(page.locator(".site-map"))
@@ -185,7 +182,6 @@ def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) 
     page.mouse.move(x + 60, y + 60)
     page.mouse.click(x + 3, y - 3)
     expect(page.locator("h1")).to_have_text(name)
-    assert seen.faults == []
 
 
 def listed(page: Page) -> Locator:
@@ -193,7 +189,7 @@ def listed(page: Page) -> Locator:
 
 
 def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served: Served) -> None:
-    seen = opened(page, served, "failures")
+    opened(page, served, "failures")
     expect(page.get_by_role("list", name="Cause")).to_contain_text("<b>bold</b>")
     expect(listed(page).filter(has_text="suspected")).to_contain_text("<b>bold</b>")
     assert page.locator("main b").count() == 0, "words of robots are words"
@@ -215,11 +211,10 @@ def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served
         page, "[...document.querySelectorAll('main figure img')].every(i => i.complete && i.naturalWidth === 160)"
     )
     assert page.locator("main figure img").count() == 2
-    assert seen.faults == []
 
 
 def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
-    seen = opened(page, served, "failures", robot="tug-12")
+    opened(page, served, "failures", robot="tug-12")
     expect(page.get_by_role("status")).to_have_text("No failures match.")
     with Bus(served.zenoh).open() as bus:
         report = encode_message(failure("tug-12", "live", cause="glare"))
@@ -227,14 +222,13 @@ def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
         assert not decode_message(answer, FailureAck).refused
     expect(listed(page)).to_contain_text("glare")
     assert [mark["tone"] for mark in marks(page)] == ["bad"]
-    assert seen.faults == []
 
 
 def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> None:
     with MapStore.open(served.folder) as store:  # a later night, in which nothing happened
         waiting = {"waiting": [{"name": "friday.mcap", "reason": "it is not whole yet"}]}
         store.update_job(store.begin_job(SITE, "nightly"), "done", "nothing to build", waiting)
-    seen = opened(page, served, "surveys")
+    opened(page, served, "surveys")
     jobs, recordings = page.get_by_role("list", name="Jobs"), page.get_by_role("list", name="Recordings")
     expect(jobs).to_contain_text("recording tuesday: cameras are swapped")
     told = [re.sub(r"\s+", " ", row) for row in recordings.locator("> li").all_inner_texts()]
@@ -270,11 +264,10 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
         expect(jobs).to_contain_text("odometry: 1 of 10")
         store.update_job(new, "failed", "no frames", {})
         expect(jobs).to_contain_text("no frames", timeout=15_000)
-    assert seen.faults == []
 
 
 def test_a_time_is_dragged_in_a_chart_and_kept_on_other_pages(page: Page, served: Served) -> None:
-    seen = opened(page, served, "failures")
+    opened(page, served, "failures")
     chart = page.locator("#chart")
     first_ms, end_ms = (float(chart.get_attribute(f"data-{name}")) for name in ("since", "until"))
     box = box_of(chart)
@@ -300,7 +293,6 @@ def test_a_time_is_dragged_in_a_chart_and_kept_on_other_pages(page: Page, served
     page.wait_for_url(re.compile("since=.*until="))
     since, until = (datetime.fromisoformat(parse_qs(urlsplit(page.url).query)[name][0]) for name in SPAN)
     assert until - since == pytest.approx(timedelta(days=7.5), abs=timedelta(hours=12))
-    assert seen.faults == []
 
 
 def test_a_robots_page_opens_on_its_last_drive(page: Page, tmp_path: Path) -> None:
@@ -314,16 +306,15 @@ def test_a_robots_page_opens_on_its_last_drive(page: Page, tmp_path: Path) -> No
             batch.traces.append(row)
         store.fleet.add(batch)
     with serving(tmp_path) as served:
-        seen = opened(page, served, "robots/tug-7")
+        opened(page, served, "robots/tug-7")
         expect(page.locator(".range summary")).to_have_text("Last drive")
         shown_ms = [int(page.locator("#band").get_attribute(f"data-{name}")) for name in SPAN]
         assert [ms / 1000 - begin_ns / 1e9 for ms in shown_ms] == pytest.approx([0.0, 1220.0], abs=60)
         expect(page.locator(".site-map path.line.good")).to_have_count(2)
-        assert seen.faults == []
 
 
 def test_versions_are_compared(page: Page, served: Served) -> None:
-    seen = opened(page, served, "map", before=1, after=3)
+    opened(page, served, "map", before=1, after=3)
     expect(page.locator("path.cell.added")).to_have_count(2)
     assert page.locator("path.cell.changed").count() == 6
     content = page.locator("main")
@@ -335,7 +326,6 @@ def test_versions_are_compared(page: Page, served: Served) -> None:
     assert sides == ["inset(0px 75% 0px 0px)", "inset(0px 0px 0px 25%)"]
     one, other = swipe.locator("image").evaluate_all("all => all.map(i => i.width.baseVal.value)")
     assert other - one == pytest.approx(16.0, abs=1.0), "a tile was added"
-    assert seen.faults == []
 
 
 def test_a_page_that_stays_as_it_is_is_not_sent_again(served: Served) -> None:
@@ -412,10 +402,11 @@ def test_a_refused_stream_is_opened_again_and_a_hidden_page_has_none(page: Page,
         window.EventSource = class extends EventSource { constructor(to) { super(to); window.streams.push(this); } };"""
     )
     page.route("**/now?*", lambda route: route.fulfill(status=502))
-    opened(page, served, "")
+    seen = opened(page, served, "")
     line = page.locator("#line")
     expect(line).to_have_text("The server does not answer; trying again.")
     page.unroute("**/now?*")
+    seen.refused(502)
     expect(line).to_contain_text("robots")
     turned = "on => { Object.defineProperty(document, 'hidden', { value: on, configurable: true });"
     turned += "document.dispatchEvent(new Event('visibilitychange')); }"
@@ -445,3 +436,4 @@ def test_under_another_name_there_is_no_page(page: Page, served: Served) -> None
     answer = page.goto(f"http://elsewhere.example:{urlsplit(served.http).port}/dashboard/map")
     assert answer.status == 403
     assert "unknown host name" in page.content()
+    watch(page).refused(403)

@@ -8,7 +8,9 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -31,6 +33,7 @@ from fleetmap.messages import (
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, DraftContent, MapStore
+from support.pages.browser import agree
 from support.storage.map_samples import draft_details
 
 SITE = "hall"
@@ -268,10 +271,15 @@ class Seen:
     requests: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
-    def elsewhere(self, allowed: Sequence[str]) -> list[str]:
-        """Requested addresses that begin with none of the allowed ones."""
-        inside = ("data:", "blob:", *allowed)
-        return [address for address in self.requests if not address.startswith(inside)]
+    def refused(self, *statuses: int) -> None:
+        """So it was answered, and had no other faults; they are forgotten."""
+        faults = [fault[:3] for fault in self.faults if not fault.startswith("Failed to load resource: ")]
+        assert faults == [str(status) for status in statuses], self.faults
+        self.faults.clear()
+
+    def servers(self) -> set[str]:
+        """Hosts and ports that were asked."""
+        return {urlsplit(address).netloc for address in self.requests if not address.startswith(("data:", "blob:"))}
 
 
 def is_fault(kind: str, text: str) -> bool:
@@ -279,8 +287,9 @@ def is_fault(kind: str, text: str) -> bool:
     return kind in {"error", "warning"} and "GL Driver Message (OpenGL, Performance" not in text
 
 
+@lru_cache(maxsize=4)
 def watch(page) -> Seen:  # type: ignore[no-untyped-def]
-    """Record a page's requests, console errors, and error responses."""
+    """A page's requests, console errors and error responses since this was first asked."""
     seen = Seen()
     page.on("request", lambda request: seen.requests.append(request.url))
     page.on("websocket", lambda socket: seen.requests.append(socket.url))
@@ -329,8 +338,5 @@ def overlapping(
 def change(page: Page, words: str, *, name: str | None = "ada") -> None:
     """Asks for a change and confirms it."""
     page.get_by_role("button", name=words, exact=True).click()
-    dialog = page.get_by_role("dialog")
-    if name is not None:
-        dialog.get_by_label("Your name").fill(name)
-    dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
-    dialog.get_by_role("button", name=f"Yes: {words}").click()
+    named = {} if name is None else {"Your name": name}
+    agree(page, named | {"Reason": "robots lose themselves in aisle 3"})

@@ -1,14 +1,15 @@
 """Debian's chromium for tests of the pages; killed if it takes too long to close."""
 
+import re
 import shutil
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import psutil
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Error, FloatRect, Locator, Playwright, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Error, FloatRect, Locator, Page, Playwright, sync_playwright
 
 _CLOSE_S = 30.0
 
@@ -75,6 +76,19 @@ def box_of(thing: Locator) -> FloatRect:
             return box
         thing.page.wait_for_timeout(100)
     raise AssertionError(f"{thing} has no box: it is not visible")
+
+
+def fill(page: Page, fields: Mapping[str, str]) -> None:
+    """Fills fields of the open dialog, by their labels."""
+    for label, value in fields.items():
+        field = page.get_by_role("dialog").get_by_label(label)
+        (field.select_option if field.evaluate("field => field.matches('select')") else field.fill)(value)
+
+
+def agree(page: Page, fields: Mapping[str, str]) -> None:
+    """Fills fields of the open dialog, and says yes."""
+    fill(page, fields)
+    page.get_by_role("dialog").get_by_role("button", name=re.compile("^Yes")).click()
 
 
 @contextmanager

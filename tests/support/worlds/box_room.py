@@ -71,6 +71,12 @@ def ride_sample(ride: Ride, frames: int, frame_s: float, *, seed: int = 0, begin
     return Sample(stamps, left, right, imu_stamps, gyro, accel, truth)
 
 
+@lru_cache(maxsize=1)
+def there_and_back() -> Sample:
+    """Six seconds along the wall and back, by 61 frames."""
+    return ride_sample(out_and_back(6.0), 61, 0.1)
+
+
 def _imu(ride: Ride, t_s: float, h_s: float = 1e-3) -> tuple[Array, Array]:
     """Angular rate and specific force in body axes, by central differences."""
     before, now, after = ride(t_s - h_s), ride(t_s), ride(t_s + h_s)
