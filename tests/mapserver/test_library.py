@@ -10,18 +10,11 @@ import pytest
 import mapserver
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from mapserver import Actor, BuildOptions, build_map, open_map, open_store
-from support.recordings.recording_samples import write_mcap
-from support.worlds.box_room import out_and_back, ride_sample
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_mcap(tmp_path_factory.mktemp("drive") / "drive", ride_sample(out_and_back(6.0), 61, 0.1))
-
-
-def test_a_map_in_five_lines(recording: Path, tmp_path: Path) -> None:
+def test_a_map_in_five_lines(room_ride: Path, tmp_path: Path) -> None:
     """Paths as text; the draft, its picture, publishing, and the published version as arrays."""
-    draft = build_map(str(recording), str(tmp_path / "maps"), "hall", BuildOptions(frame_from_ground_truth=True))
+    draft = build_map(str(room_ride), str(tmp_path / "maps"), "hall", BuildOptions(frame_from_ground_truth=True))
     assert draft.version == 1
     assert draft.report["keyframes"] == len(draft.map.map_from_body)
     assert draft.report["ate_rmse_m"] < 0.05
@@ -52,29 +45,26 @@ def test_a_wrong_site_name_is_refused_before_anything_is_read(tmp_path: Path) ->
         build_map([tmp_path / "nowhere"], tmp_path / "maps", "Hall 1")
 
 
-def test_importing_is_light() -> None:
-    heavy = "print([m for m in ('numpy', 'cv2', 'gtsam', 'scipy', 'fastapi') if m in sys.modules])"
-    words = [sys.executable, "-c", f"import sys, mapserver; mapserver.__version__; {heavy}"]
-    done = subprocess.run(words, capture_output=True, check=True)
-    assert done.stdout == b"[]\n"
+@pytest.mark.parametrize(
+    ("imported", "unneeded"),
+    [
+        ("mapserver; mapserver.__version__", "numpy cv2 gtsam scipy fastapi"),
+        # scipy.stats alone takes half a second.
+        ("mapserver.library", "scipy.stats scipy.optimize matplotlib fastapi jinja2 distributed zenoh"),
+        # Every command reads one, and the server keeps it; these take most of a second, and 100 MB of the server.
+        ("mapserver.config", "cv2 gtsam"),
+    ],
+)
+def test_importing_loads_no_library_that_is_not_needed(imported: str, unneeded: str) -> None:
+    script = f"import sys, {imported}; print([m for m in {unneeded.split()} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_a_name_that_it_does_not_have() -> None:
     assert set(mapserver.__all__) <= set(dir(mapserver))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = mapserver.nonsense
-
-
-def test_a_build_loads_no_library_that_it_does_not_need() -> None:
-    """scipy.stats alone takes half a second."""
-    unneeded = ("scipy.stats", "scipy.optimize", "matplotlib", "fastapi", "jinja2", "distributed", "zenoh")
-    script = f"import sys, mapserver.library; print([m for m in {unneeded!r} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
-
-
-def test_a_configuration_is_read_without_what_surveys_compute_with() -> None:
-    """Every command reads one, and the server keeps it; OpenCV and gtsam take most of a second, and 100 MB of the server."""
-    script = "import sys, mapserver.config; print([m for m in ('cv2', 'gtsam') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
 
 
 def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:

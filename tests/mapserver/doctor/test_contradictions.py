@@ -64,9 +64,11 @@ def remembered(look: Callable[..., object], seen: dict[object, object]) -> Calla
 def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Change:
     """Samples multiplied by matrices (3, 3) or numbers."""
     by_accel, by_gyro = (np.eye(3) * by if np.ndim(by) < 2 else by for by in (accel, gyro))
-    return lambda r: replace(
-        r, imu=ImuSamples(r.imu.stamps_ns, r.imu.gyro_radps @ by_gyro.T, r.imu.accel_mps2 @ by_accel.T)
-    )
+
+    def changed(of: ImuSamples) -> ImuSamples:
+        return ImuSamples(of.stamps_ns, of.gyro_radps @ by_gyro.T, of.accel_mps2 @ by_accel.T)
+
+    return lambda r: replace(r, imu=changed(r.imu))
 
 
 def wheels(speed: float = 1.0, yaw: float = 1.0) -> Change:
@@ -150,17 +152,15 @@ def rotated(message: Any) -> None:
     message.data = message.data[::-1].copy()  # grey rows without padding
 
 
+ROTATED = "images of both cameras are rotated by 180 degrees: switch the driver's"
+
+
 @needs_plugin("rosbag1")
 @pytest.mark.parametrize(
     ("kind", "change", "name", "says"),
     [
         ("sensor_msgs/Imu", negated, "accelerometer axes", "has the wrong sign:"),
-        (
-            "sensor_msgs/Image",
-            rotated,
-            "left and right",
-            "images of both cameras are rotated by 180 degrees: switch the driver's",
-        ),
+        ("sensor_msgs/Image", rotated, "left and right", ROTATED),
     ],
 )
 def test_a_ros_1_bag_with_a_fault_is_named_alike(

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import so3_exp
@@ -16,7 +14,6 @@ from fleetmap.recordings import Recording, format_calibration, open_recording, r
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.calibration import CalibrationParameter
-from mapserver.commands.recordings import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import grouped, not_judged, summary
@@ -278,15 +275,9 @@ def test_stamps_that_move_within_the_run_are_no_time_offset() -> None:
     assert {finding.verdict for finding in findings[1:]} == {Verdict.OK}
 
 
-def run(*arguments: str) -> int:
-    app = typer.Typer()
-    app.command()(doctor)
-    return CliRunner().invoke(app, list(arguments)).exit_code
-
-
-def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> None:
+def test_the_command_writes_json_and_ends_with_3_on_failure(run, tmp_path: Path) -> None:
     folder = write_euroc(tmp_path / "r", SAMPLE)
-    assert run(str(folder), "--json", str(tmp_path / "good.json")) == 0
+    run("doctor", folder, "--json", tmp_path / "good.json")
     report = json.loads((tmp_path / "good.json").read_text())
     assert (report["verdict"], report["frames"], report["sensor_set"]) == ("not judged", 26, "stereo-inertial")
     missing = {f["name"]: f["missing"] for f in report["findings"] if f["verdict"] == "not judged"}
@@ -297,7 +288,7 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
         (folder / f"mav0/cam{number}/data").rename(folder / f"mav0/cam{number}/was")
     (folder / "mav0/cam0/was").rename(folder / "mav0/cam1/data")
     (folder / "mav0/cam1/was").rename(folder / "mav0/cam0/data")
-    assert run(str(folder), "--json", str(tmp_path / "bad.json")) == 3
+    run("doctor", folder, "--json", tmp_path / "bad.json", status=3)
     report = json.loads((tmp_path / "bad.json").read_text())
     (swapped,) = (f for f in report["findings"] if f["name"] == "left and right")
     assert swapped["verdict"] == "fail" and "swapped" in swapped["sentence"]

@@ -71,24 +71,18 @@ def test_the_time_before_a_call_goes_to_the_stage_that_used_it() -> None:
 
 
 def test_progress_is_lines_in_a_log_and_bars_on_a_terminal() -> None:
-    calls = [
-        ("odometry", 1, 2),
-        ("odometry", 2, 2),
-        ("adjust", 0, 1),
-        ("match", 2, 3),
-        ("adjust", 1, 1),
-        ("match", 3, 3),
-    ]
-    log = Console(record=True, force_terminal=False, width=80, file=io.StringIO())
-    with ProgressView(log) as view:
-        for call in calls:
-            view(*call)
-    assert log.export_text().splitlines() == ["odometry: 2", "adjust", "match: 3", "adjust", "match: 3"]
-    terminal = Console(record=True, force_terminal=True, width=80, file=io.StringIO())
-    with ProgressView(terminal) as view:
-        for call in calls:
-            view(*call)
-    shown = terminal.export_text()
+    def printed(*, is_terminal: bool) -> str:
+        console = Console(record=True, force_terminal=is_terminal, width=80, file=io.StringIO())
+        with ProgressView(console) as view:
+            for number in (1, 2):
+                view("odometry", number, 2)
+            for number in (0, 1):
+                view("adjust", number, 1)
+                view("match", number + 2, 3)
+        return console.export_text()
+
+    assert printed(is_terminal=False).splitlines() == ["odometry: 2", "adjust", "match: 3", "adjust", "match: 3"]
+    shown = printed(is_terminal=True)
     assert "odometry" in shown
     assert "2/2" in shown
     assert "3/3" in shown
@@ -116,7 +110,6 @@ def test_zones_are_read(tmp_path: Path) -> None:
     ],
 )
 def test_bad_zones_are_named(tmp_path: Path, text: str, said: str) -> None:
-    file = tmp_path / "zones.toml"
-    file.write_text(text)
+    (tmp_path / "zones.toml").write_text(text)
     with pytest.raises(UsageError, match=said):
-        read_zones(file)
+        read_zones(tmp_path / "zones.toml")

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner, Result
 
 from fleetmap.bow.vocabulary import DEFAULT_VOCABULARY_SHA256, decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
@@ -19,6 +18,7 @@ from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from support.plugins import needs_plugin
 from support.recordings.recording_samples import make_sample, write_euroc, write_mcap
+from support.room_site import invoke, run
 
 FRAMES = 24
 SAMPLE = make_sample(FRAMES)
@@ -37,20 +37,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", SAMPLE)
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["build", *(str(a) for a in arguments)])
-
-
 def built(*arguments: object) -> str:
-    result = run(*arguments)
-    if result.exception is not None:
-        raise result.exception
-    assert result.exit_code == 0
-    return result.stdout
+    return run(app, "build", *arguments)
 
 
 def refused(*arguments: object) -> FleetmapError:
-    result = run(*arguments)
+    result = invoke(app, "build", *arguments)
     assert isinstance(result.exception, FleetmapError), result.output
     return result.exception
 

@@ -94,16 +94,7 @@ def test_two_wrong_pins_of_seven_are_named() -> None:
 
 def test_a_pin_is_read() -> None:
     assert parse_pin("gate 3=120.5,-4e2:.5,7") == Pin("gate 3", (120.5, -400.0), (0.5, 7.0))
-    for text in (
-        "gate",
-        "g=1,2",
-        "g=1,2:3",
-        "=1,2:3,4",
-        "g=1,nan:3,4",
-        "g=1,2:3,1e999",
-        "g=1e200,2:3,4",
-        "g\n=1,2:3,4",
-        "g=1,2:3,4,5",
-    ):
+    short, wild = ("gate", "g=1,2", "g=1,2:3", "=1,2:3,4"), ("g=1,nan:3,4", "g=1,2:3,1e999", "g=1e200,2:3,4")
+    for text in (*short, *wild, "g\n=1,2:3,4", "g=1,2:3,4,5"):
         with pytest.raises(UsageError, match=r"pin .* write NAME"):
             parse_pin(text)

@@ -97,10 +97,17 @@ def verdict(
     done, own = sound()
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
     before = Before(manifest(current, 1), done.map, current, []) if has_current else None
-    session = MappedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
-    evidence = examine_draft(tiles, done.vocabulary, survey_map.camera, before, [session], [])
+    driven = MappedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
+    evidence = examine_draft(tiles, done.vocabulary, survey_map.camera, before, [driven], [])
     said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, GateSettings(), evidence)
     return said, evidence
+
+
+@lru_cache(maxsize=1)
+def session() -> MappedSession:
+    """The sound ride with what the survey did not use of it."""
+    done, own = sound()
+    return MappedSession(done.map.trajectory, own, done)
 
 
 def changed(points: Callable[[Array], Array], places: Callable[[Array], Array] = lambda x: x) -> SurveyMap:
@@ -183,25 +190,20 @@ def nights_after(first: SurveyMap, nights: int) -> SurveyMap:
 
 def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
     """Of a draft with the current version's own tiles; archive: what that knows."""
-    done, own = sound()
-    before = Before(manifest(tiles, 1), archive, tiles, [])
-    session = MappedSession(done.map.trajectory, own, done)
-    return examine_draft(tiles, done.vocabulary, done.map.camera, before, [session], [])
+    done, before = sound()[0], Before(manifest(tiles, 1), archive, tiles, [])
+    return examine_draft(tiles, done.vocabulary, done.map.camera, before, [session()], [])
 
 
 def test_frames_that_choose_landmarks_do_not_judge_the_draft() -> None:
     done, own = sound()
-    session = MappedSession(done.map.trajectory, own, done)
     _, evidence = verdict(done.map, has_current=False)
-    assert evidence.held_out.draft.frames + len(asked_views([session])) == len(own)
-    assert {f.number for f in session.asked(1)}.isdisjoint(f.number for f in session.judging(1))
+    assert evidence.held_out.draft.frames + len(asked_views([session()])) == len(own)
+    assert {f.number for f in session().asked(1)}.isdisjoint(f.number for f in session().judging(1))
 
 
 def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if_there_are_none() -> None:
     """Robots have the first wall already and the budget is full: seen at the ends of drives, whose last view got too little."""
-    done, own = sound()
-    session, survey_map = MappedSession(done.map.trajectory, own, done), done.map
-    views = asked_views([session])
+    survey_map, views = sound()[0].map, asked_views([session()])
     is_old = at_first_wall(survey_map.points_map)
     full = BudgetSettings(landmarks_per_m=0.0, min_landmarks=int(is_old.sum()))
     chooser = TileChooser(survey_map, full, survey_map.landmark_ids[is_old], WORDS)
@@ -223,9 +225,8 @@ def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if
 
 
 def test_a_second_choice_that_loses_more_views_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    done, own = sound()
-    views = asked_views([MappedSession(done.map.trajectory, own, done)])
-    chooser = TileChooser(done.map, BudgetSettings(), None, WORDS)
+    views = asked_views([session()])
+    chooser = TileChooser(sound()[0].map, BudgetSettings(), None, WORDS)
     fixes = chooser._fixes(chooser._tiles(()), views)
     assert None not in fixes
     one, two = [None, *fixes[1:]], [*fixes[:-2], None, None]
@@ -238,11 +239,10 @@ def test_a_second_choice_that_loses_more_views_is_not_taken(monkeypatch: pytest.
 
 def test_a_view_that_is_found_elsewhere_gets_no_landmarks() -> None:
     """A metre aside, within the radius of the prior."""
-    done, own = sound()
-    view = asked_views([MappedSession(done.map.trajectory, own, done)])[0]
+    view = asked_views([session()])[0]
     elsewhere = view.probe.map_from_cam.copy()
     elsewhere[:3, 3] += np.cross(facing(), [0, 0, 1.0])
-    chooser = TileChooser(done.map, BudgetSettings(), None, WORDS)
+    chooser = TileChooser(sound()[0].map, BudgetSettings(), None, WORDS)
     assert chooser._sighting(view.probe) is not None
     assert chooser._sighting(replace(view.probe, map_from_cam=elsewhere)) is None
 

@@ -1,7 +1,6 @@
 """Admission to the bus: the policy of endpoints, names that are not enrolled (row 9), and rules that follow the register."""
 
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,6 +25,7 @@ from mapserver.trust import init_here
 from mapserver.trust.authorities import Authorities, Authority
 from mapserver.trust.enrolment import Enrolment, RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
 
 DAY_NS = 86_400_000_000_000
@@ -55,12 +55,12 @@ def test_which_endpoints_are_allowed(endpoint: str, insecure: bool, is_allowed: 
 
 
 @pytest.fixture
-def register(tmp_path: Path) -> Iterator[RobotRegister]:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        publish_samples(store, 1)
-        init_here(store)
-        RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
-        yield RobotRegister(store)
+def register(store: MapStore, clock: Clock) -> RobotRegister:
+    clock.now_ns = time.time_ns()
+    publish_samples(store, 1)
+    init_here(store)
+    RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
+    return RobotRegister(store)
 
 
 def test_tls_needs_certificates_and_loopback_nothing(
@@ -198,14 +198,12 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
         service.close()
 
 
-def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path: Path) -> None:
+def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(
+    tmp_path: Path, register: RobotRegister, clock: Clock
+) -> None:
     """Over TLS: who copied the key before is silenced, and the robot's session takes the new files by itself."""
-    clock = {"ns": int(time.time() * 1e9)}
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, ExitStack() as stack:
-        publish_samples(store, 1)
-        init_here(store)
-        register = RobotRegister(store)
-        register.authorities.init(["127.0.0.1"], None, None)
+    store = register.store
+    with ExitStack() as stack:
         bundle = enrolment.decode_bundle(register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")["r1"]).own.encode()
         servers = tmp_path / "servers.ca"
         servers.write_text(register.authorities.servers)
@@ -217,7 +215,7 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
 
         own, stolen = tmp_path / "own.pem", tmp_path / "stolen.pem"
         own.write_bytes(renewed(bundle))
-        clock["ns"] += 2 * DAY_NS
+        clock.now_ns += 2 * DAY_NS
         bus, guard = prepare_bus(store, "tls/127.0.0.1:0", insecure=False)
         service = BusService(store, Fleet(store), bus, lambda *_: None, guard)
         stack.callback(service.close)
@@ -231,7 +229,7 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
         assert not guard.follow()
         thief = stack.enter_context(Bus(bus.endpoint, tls=TlsFiles(servers, stolen)).open())
         assert thief.get(wanted, timeout_s=20), "the control: at once both certificates are let in"
-        clock["ns"] += DAY_NS
+        clock.now_ns += DAY_NS
         guard._due_s = 0.0
         assert guard.follow()
         assert robot.get(wanted, timeout_s=20)

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -35,16 +34,10 @@ from mapserver.serving.bus_service import ByteCache
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus
 from support.fleet.reports import blindness
-from support.fleet.served_world import World, served_world
+from support.fleet.served_world import World
 from support.storage.map_samples import publish_samples, save_grid_draft, save_sample_draft
 
 FOREIGN_VOCABULARY = b"other" * 50
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with served_world(tmp_path) as made:
-        yield made
 
 
 def test_a_robot_fetches_everything_once(world: World) -> None:

@@ -6,21 +6,13 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from mapserver import cli, releases
+from mapserver import releases
 from mapserver.store import Actor, MapStore
 from mapserver.trust import init_here
 from support.storage.map_samples import save_sample_draft
 
 TRIGGERS = ("events_are_kept", "events_stay_as_they_are")
-
-
-def run(*arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(cli.app, ["audit", *arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
 
 
 def rewrite(folder: Path, *statements: str) -> None:
@@ -51,12 +43,12 @@ def folder(made: Path, tmp_path: Path) -> Path:
     return shutil.copytree(made, tmp_path / "store")
 
 
-def test_an_honest_log_is_clean(folder: Path) -> None:
-    assert run("--store", str(folder), "--verify") == (0, "6 lines, clean\n")
-    status, printed = run("--store", str(folder))
-    assert (status, len(printed.splitlines())) == (0, 6)
+def test_an_honest_log_is_clean(run, folder: Path) -> None:
+    assert run("audit", "--store", folder, "--verify") == "6 lines, clean\n"
+    printed = run("audit", "--store", folder)
+    assert len(printed.splitlines()) == 6
     assert "enrolled, 'tug-7', by 'ada' (signed in), from '10.0.0.1'" in printed
-    assert len(json.loads(run("--store", str(folder), "--last", "2", "--json")[1])) == 2
+    assert len(json.loads(run("audit", "--store", folder, "--last", "2", "--json"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -69,8 +61,6 @@ def test_an_honest_log_is_clean(folder: Path) -> None:
         ("INSERT INTO events (id, stamp_ns, site, kind, detail) VALUES (7, 1, 'lab', 'x', 'y')", "line 7 was changed"),
     ],
 )
-def test_a_changed_line_is_found(folder: Path, statement: str, words: str) -> None:
+def test_a_changed_line_is_found(run, folder: Path, statement: str, words: str) -> None:
     rewrite(folder, statement)
-    status, printed = run("--store", str(folder), "--verify")
-    assert status == 3
-    assert words in printed
+    assert words in run("audit", "--store", folder, "--verify", status=3)

@@ -23,17 +23,10 @@ from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 GOLDEN = Path(__file__).parents[2] / "golden"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        f"tile-{TILE_FORMAT}.fmtl",
-        f"manifest-{MANIFEST_FORMAT}.json",
-        f"archive-{ARCHIVE_FORMAT}.fmar",
-        f"version-{EXPORT_FORMAT}.fmex",
-    ],
-)
-def test_every_format_has_its_file(name: str) -> None:
-    assert (GOLDEN / name).is_file(), "python tests/golden/add.py adds the newest"
+def test_every_format_has_its_file() -> None:
+    files = f"tile-{TILE_FORMAT}.fmtl", f"manifest-{MANIFEST_FORMAT}.json", f"archive-{ARCHIVE_FORMAT}.fmar"
+    for name in (*files, f"version-{EXPORT_FORMAT}.fmex"):
+        assert (GOLDEN / name).is_file(), f"{name}: python tests/golden/add.py adds the newest"
 
 
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("tile-*.fmtl")), ids=lambda file: file.stem)
@@ -86,17 +79,16 @@ def test_archives(file: Path) -> None:
     assert survey.map_from_body.shape == (3, 4, 4)
 
 
-def test_exports(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        info = store.import_version(GOLDEN / f"version-{EXPORT_FORMAT}.fmex", actor=Actor("ada"))
-        assert list(known_grid(store.manifest("lab", 1), store.blob)) == [(0, 0)]
-        assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
-        assert store.archive("lab", 1) == b"archive 1"
-        assert releases.publish(store, "lab") == 1
-        assert store.verify().faults == []
+def test_exports(store: MapStore) -> None:
+    info = store.import_version(GOLDEN / f"version-{EXPORT_FORMAT}.fmex", actor=Actor("ada"))
+    assert list(known_grid(store.manifest("lab", 1), store.blob)) == [(0, 0)]
+    assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
+    assert store.archive("lab", 1) == b"archive 1"
+    assert releases.publish(store, "lab") == 1
+    assert store.verify().faults == []
 
 
-def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
+def test_newer_formats_are_refused_by_number(store: MapStore, tmp_path: Path) -> None:
     with pytest.raises(NewerFormatError, match=f"format {TILE_FORMAT + 1}.*up to {TILE_FORMAT}"):
         decode_tile(pack(b"FMTL", TILE_FORMAT + 1, b""))
     with pytest.raises(NewerFormatError, match=f"format {ARCHIVE_FORMAT + 1}.*up to {ARCHIVE_FORMAT}"):
@@ -106,7 +98,6 @@ def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
     export = bytearray((GOLDEN / f"version-{EXPORT_FORMAT}.fmex").read_bytes())
     struct.pack_into("<H", export, 4, EXPORT_FORMAT + 1)
     (tmp_path / "newer.fmex").write_bytes(export)
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        with pytest.raises(NewerFormatError, match=f"format {EXPORT_FORMAT + 1}.*up to {EXPORT_FORMAT}"):
-            store.import_version(tmp_path / "newer.fmex")
-        assert store.sites() == []
+    with pytest.raises(NewerFormatError, match=f"format {EXPORT_FORMAT + 1}.*up to {EXPORT_FORMAT}"):
+        store.import_version(tmp_path / "newer.fmex")
+    assert store.sites() == []

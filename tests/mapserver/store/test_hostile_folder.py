@@ -215,19 +215,12 @@ def test_a_full_disk_can_be_read_and_cleared(root: Path, reserve: str, is_killed
         (root / "store.sqlite3-wal").write_bytes(log)
     is_read = reserve == "with reserve" and not is_killed
     files = len([path for path in (root / "blobs").rglob("*") if path.is_file()])
-    paths = ":".join([str(TESTS), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-c", ON_A_FULL_DISK, paths, str(root), reserve, "read" if is_read else ""],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    statuses = dict(
-        line.split()
-        for line in done.stdout.splitlines()
-        if line.split()[0] in {"versions", "inspect", "diff", "gc"} and len(line.split()) == 2
-    )
+    given = ":".join([str(TESTS), *sys.path]), str(root), reserve, "read" if is_read else ""
+    command = [sys.executable, "-c", ON_A_FULL_DISK, *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    lines = [line.split() for line in done.stdout.splitlines()]
+    commands = {"versions", "inspect", "diff", "gc"}
+    statuses = dict(words for words in lines if words[0] in commands and len(words) == 2)
     if is_read:
         assert [statuses[name] for name in ("versions", "inspect", "diff")] == ["0", "0", "0"], done.stderr
         assert "verify 0" in done.stdout

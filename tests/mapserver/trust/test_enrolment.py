@@ -1,6 +1,6 @@
 """Enrolment on the in-memory bus: bundles, renewals, lost answers, copies (row 35), and the authorities behind them."""
 
-from collections.abc import Iterator
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.status import trust_status
+from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
 
 ENDPOINT = "tls/127.0.0.1:7447"
@@ -22,7 +23,7 @@ DAY_NS = 86_400_000_000_000
 
 
 class World:
-    def __init__(self, store: MapStore, clock: dict[str, int]) -> None:
+    def __init__(self, store: MapStore, clock: Clock) -> None:
         self.store, self.clock, self.register = store, clock, RobotRegister(store)
 
     def bundle(self, robot: str = "r1", site: str = "lab") -> enrolment.Bundle:
@@ -37,14 +38,13 @@ class World:
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    clock = {"ns": int(datetime.now(UTC).timestamp() * 1e9)}
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store:
-        save_sample_draft(store)
-        init_here(store)
-        made = World(store, clock)
-        made.register.authorities.init(["127.0.0.1", "maps.example"], None, None)
-        yield made
+def world(store: MapStore, clock: Clock) -> World:
+    clock.now_ns = time.time_ns()
+    save_sample_draft(store)
+    init_here(store)
+    made = World(store, clock)
+    made.register.authorities.init(["127.0.0.1", "maps.example"], None, None)
+    return made
 
 
 def test_a_robot_gets_a_certificate_and_renews_it(world: World) -> None:
@@ -57,12 +57,12 @@ def test_a_robot_gets_a_certificate_and_renews_it(world: World) -> None:
     assert timedelta(days=364) < about.ends - datetime.now(UTC) < timedelta(days=366)
     (entry,) = world.register.robots("lab")
     assert (entry.certificate, world.register.access().holder(about.name).robot) == (about.name, "r1")
-    world.clock["ns"] += DAY_NS
+    world.clock.now_ns += DAY_NS
     before = world.register.access()
     renewed = world.ask(first, second)
     assert world.register.access() == before, "a renewal interrupts nobody"
     assert world.ask(first, second).name == renewed.name != about.name
-    world.clock["ns"] += DAY_NS  # from here on the certificate before may only ask again, for an answer that was lost
+    world.clock.now_ns += DAY_NS  # from here on the certificate before may only ask again, for an answer that was lost
     purposes = [world.register.access().holder(name).purpose for name in (renewed.name, about.name)]
     assert purposes == [Purpose.ROBOT, Purpose.ENROL]
     kinds = [event.kind for event in world.store.events("lab")]
@@ -132,9 +132,9 @@ def test_the_bundles_name_leaves_the_rules_after_a_day(world: World) -> None:
     world.bundle()
     name = world.register.robots()[0].bundle
     assert world.register.access().holder(name).purpose is Purpose.ENROL
-    world.clock["ns"] += DAY_NS + 1
+    world.clock.now_ns += DAY_NS + 1
     assert world.register.access().holder(name) is None
-    assert "bundle expired" in world.register.robots()[0].shown(world.clock["ns"]).state
+    assert "bundle expired" in world.register.robots()[0].shown(world.clock.now_ns).state
 
 
 def test_long_names_differ_by_their_marks(world: World) -> None:
@@ -167,26 +167,25 @@ def test_rotations(world: World) -> None:
         authorities.init(["a"], None, None)
 
 
-def test_the_servers_key_on_a_stick(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        authorities = RobotRegister(store).authorities
-        with pytest.raises(StateError, match="trust init --here --host NAME"):
-            _ = RobotRegister(store).tls
-        with pytest.raises(UsageError, match="an invalid name or address"):
-            authorities.init(["a b"], None, None)
-        stick = tmp_path / "ada" / "servers-ca.pem"
-        authorities.init(["maps.example"], stick, "abcd-efgh")
-        assert not (authorities.folder / "servers-ca.pem").exists()
-        assert stick.stat().st_mode & 0o077 == 0
-        with pytest.raises(UsageError, match="another passphrase"):
-            authorities.rotate_server(stick, "wrong")
-        authorities.rotate_server(stick, "abcd-efgh", ["other.example"])
-        assert authorities.hosts == ("other.example",)
+def test_the_servers_key_on_a_stick(store: MapStore, tmp_path: Path) -> None:
+    authorities = RobotRegister(store).authorities
+    with pytest.raises(StateError, match="trust init --here --host NAME"):
+        _ = RobotRegister(store).tls
+    with pytest.raises(UsageError, match="an invalid name or address"):
+        authorities.init(["a b"], None, None)
+    stick = tmp_path / "ada" / "servers-ca.pem"
+    authorities.init(["maps.example"], stick, "abcd-efgh")
+    assert not (authorities.folder / "servers-ca.pem").exists()
+    assert stick.stat().st_mode & 0o077 == 0
+    with pytest.raises(UsageError, match="another passphrase"):
+        authorities.rotate_server(stick, "wrong")
+    authorities.rotate_server(stick, "abcd-efgh", ["other.example"])
+    assert authorities.hosts == ("other.example",)
 
 
 def test_status_warns_before_a_certificate_ends(world: World) -> None:
     assert not [fault for fault in trust_status(world.store).faults if "server.pem" in fault]
-    world.clock["ns"] += 370 * DAY_NS
+    world.clock.now_ns += 370 * DAY_NS
     assert "trust rotate server" in next(fault for fault in trust_status(world.store).faults if "server.pem" in fault)
 
 

@@ -28,19 +28,17 @@ def save_dense(store: MapStore, seed: int = 0) -> None:
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> tuple[str, ...]:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        save_dense(store)
-        releases.publish(store, "lab")
-    return ("--site", "lab", "--store", str(tmp_path / "store"))
+def site(store: MapStore) -> tuple[str, ...]:
+    save_dense(store)
+    releases.publish(store, "lab")
+    return "--site", "lab", "--store", str(store.folder)
 
 
 @pytest.fixture
-def walled(tmp_path: Path) -> tuple[str, ...]:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store)
-        save_surfel_draft(store, wall())
-    return ("--site", "lab", "--store", str(tmp_path / "store"))
+def walled(store: MapStore) -> tuple[str, ...]:
+    save_sample_draft(store)
+    save_surfel_draft(store, wall())
+    return "--site", "lab", "--store", str(store.folder)
 
 
 def read(path: Path) -> tuple[NDArray[np.uint8], list[float]]:
@@ -66,20 +64,21 @@ def test_a_grid_is_written_for_the_robots_height(run, site, tmp_path: Path) -> N
     assert np.isnan(heights["highest_m"]).sum() == TILE_CELLS**2 - 40 * 80
 
 
-def test_wrong_orders_for_grids_are_told(run, site, tmp_path: Path) -> None:
+def test_wrong_orders_for_grids_are_told(run, site, store: MapStore, tmp_path: Path) -> None:
     assert "has no version 7" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", 7, status=2)
     assert "up to 2.10 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "3", status=2)
     assert "above 0.1 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "0.1", status=2)
     assert "a robot of nan m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "nan", status=2)
     assert "must end in .yaml" in run("grid", "export", *site, tmp_path / "a.pgm", status=2)
     assert "folder that exists" in run("grid", "export", *site, tmp_path / "no" / "a.yaml", status=2)
-    with MapStore.open(tmp_path / "store") as store:
-        bare = save_sample_draft(store)
+    bare = save_sample_draft(store)
     assert "occupancy_grid = true" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", bare, status=2)
     assert not list(tmp_path.glob("a.*"))
 
 
-def test_grid_and_surfels_travel_with_the_archive_and_go_with_their_version(run, site, tmp_path: Path) -> None:
+def test_grid_and_surfels_travel_with_the_archive_and_go_with_their_version(
+    run, site, store: MapStore, tmp_path: Path
+) -> None:
     other = ("--site", "lab", "--store", str(tmp_path / "other"))
     run("export", *site, tmp_path / "v.fmex")
     run("import", "--store", tmp_path / "other", tmp_path / "v.fmex")
@@ -90,20 +89,18 @@ def test_grid_and_surfels_travel_with_the_archive_and_go_with_their_version(run,
     run("export", *site, tmp_path / "robots.fmex", "--without-archive")
     formats = [(tmp_path / f"{name}.fmex").read_bytes()[4:6] for name in ("v", "robots")]
     assert formats == [b"\x03\x00", b"\x01\x00"]
-    with MapStore.open(tmp_path / "store") as store:
-        assert store.verify().faults == []
-        assert store.served_kind(store.manifest("lab", 1).report["surfels"]["sha256"]) is None  # robots never get them
-        for seed in (1, 2, 3):
-            save_dense(store, seed)
-        before = store.verify()
-        gone = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0))
-        after = store.verify()
-        assert (gone.removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
-        assert before.blobs - after.blobs >= 2 * 5  # manifest, indices and tiles of each
+    assert store.verify().faults == []
+    assert store.served_kind(store.manifest("lab", 1).report["surfels"]["sha256"]) is None  # robots never get them
+    for seed in (1, 2, 3):
+        save_dense(store, seed)
+    before = store.verify()
+    gone = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0))
+    after = store.verify()
+    assert (gone.removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
+    assert before.blobs - after.blobs >= 2 * 5  # manifest, indices and tiles of each
     run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4)
     # What is damaged is told.
-    with MapStore.open(tmp_path / "store") as store:
-        manifest = store.manifest("lab", 4)
+    manifest = store.manifest("lab", 4)
     path = next((tmp_path / "store").glob(f"blobs/*/{manifest.report['grid']['sha256']}"))
     path.write_bytes(b"{}")
     assert "damaged" in run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4, status=3)
@@ -114,13 +111,14 @@ SLOW = {"name": "crossing", "box": (4.0, 2.0, 6.0, 3.0), "mask": "speed", "perce
 SLOWER = {"name": "door", "box": (5.0, 2.0, 7.0, 3.0), "mask": "speed", "percent": 10}
 
 
-def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site, tmp_path: Path) -> None:
+def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(
+    run, site, store: MapStore, tmp_path: Path
+) -> None:
     (tmp_path / "masks.json").write_bytes(geojson(DOCK, SLOW, SLOWER))
     assert "3 areas" in run("areas", "import", tmp_path / "masks.json", *site)
-    with MapStore.open(tmp_path / "store") as store:
-        save_grid_draft(store, 1)
-        releases.publish(store, "lab")
-        assert store.verify().faults == []
+    save_grid_draft(store, 1)
+    releases.publish(store, "lab")
+    assert store.verify().faults == []
     assert run("areas", "list", *site).splitlines() == [
         "crossing: 2.0 m2, speed 30 %", "dock: 1.0 m2, keep-out", "door: 2.0 m2, speed 10 %", "3 areas",
     ]  # fmt: skip
@@ -158,10 +156,9 @@ def test_another_reader_finds_the_wall(run, walled, tmp_path: Path) -> None:
     assert np.abs(rotations @ wanted).min() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_what_changed_is_written_as_a_plan_and_as_geojson(run, walled, tmp_path: Path) -> None:
-    with MapStore.open(tmp_path / "store") as store:
-        for with_board in (False, True):
-            save_surfel_draft(store, seen_wall(with_board=with_board))
+def test_what_changed_is_written_as_a_plan_and_as_geojson(run, walled, store: MapStore, tmp_path: Path) -> None:
+    for with_board in (False, True):
+        save_surfel_draft(store, seen_wall(with_board=with_board))
     said = run("map", "changes", *walled, 3, 4, tmp_path / "c.png")
     assert "1 patches appeared" in said
     assert "0 patches vanished" in said

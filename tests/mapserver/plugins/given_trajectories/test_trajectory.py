@@ -24,22 +24,12 @@ from mapserver.plugins.given_trajectories.formats import WrittenPoses
 from mapserver.plugins.given_trajectories.given import GivenTrajectory, OwnMotion, fitted_scale, stamps_on_clock
 from mapserver.survey.odometry_pass import poses_as_odometry
 from mapserver.survey.state import OdometryPass
-from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_mcap
-from support.worlds.box_room import out_and_back, ride_sample
+from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, write_mcap
+from support.worlds.box_room import out_and_back, ride_sample, there_and_back
 
 FRAMES = 61
 FOLLOWED: dict[tuple[object, ...], OwnMotion] = {}
 OTHER_FROM_MAP = se3(so3_exp(np.array([0.4, -0.3, 0.2])), np.array([3.0, 1.0, 0.5]))
-
-
-@pytest.fixture(scope="module")
-def sample() -> Sample:
-    return ride_sample(out_and_back(6.0), FRAMES, 0.1)
-
-
-@pytest.fixture(scope="module")
-def recording(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_mcap(tmp_path_factory.mktemp("recordings") / "ride", sample)
 
 
 @pytest.fixture(autouse=True)
@@ -56,11 +46,11 @@ def followed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(given_module, "_followed", once)
 
 
-def drifted(sample: Sample) -> Array:
+def drifted() -> Array:
     """The truth with a drift of centimetres, in a frame whose z is not up."""
     rng = np.random.default_rng(3)
     drift = np.cumsum(rng.normal(0, [2e-4] * 3 + [2e-3] * 3, (FRAMES, 6)), axis=0)
-    return np.array([OTHER_FROM_MAP @ true @ se3_exp(d) for true, d in zip(sample.world_from_body, drift, strict=True)])
+    return OTHER_FROM_MAP @ np.array(there_and_back().world_from_body) @ np.array([se3_exp(d) for d in drift])
 
 
 def pose_rows(map_from_body: Array, *, scalar_first: bool = False) -> Array:
@@ -88,8 +78,8 @@ def written(
     return file
 
 
-def in_seconds(sample: Sample) -> list[str]:
-    return [f"{stamp / 10**9:.6f}" for stamp in sample.stamps_ns.tolist()]
+def in_seconds() -> list[str]:
+    return [f"{stamp / 10**9:.6f}" for stamp in there_and_back().stamps_ns.tolist()]
 
 
 def given(recording: Path, other: GivenTrajectory, use: SensorSet | None = None, frames: int = FRAMES) -> GivenPoses:
@@ -97,8 +87,8 @@ def given(recording: Path, other: GivenTrajectory, use: SensorSet | None = None,
         return other.poses_of(reduced(opened, use), np.arange(frames))
 
 
-def off_m(found: GivenPoses, sample: Sample) -> float:
-    truth = Trajectory(sample.stamps_ns, np.array(sample.world_from_body))
+def off_m(found: GivenPoses) -> float:
+    truth = Trajectory(there_and_back().stamps_ns, np.array(there_and_back().world_from_body))
     return absolute_trajectory_error(found.trajectory, truth).rmse_m
 
 
@@ -114,25 +104,19 @@ def off_m(found: GivenPoses, sample: Sample) -> float:
     ],
 )
 def test_a_wrong_convention_is_refused_with_the_one_that_fits(
-    sample: Sample,
-    recording: Path,
-    tmp_path: Path,
-    use: SensorSet | None,
-    frame: str,
-    wrong: dict[str, Any],
-    instead: str,
+    room_ride: Path, tmp_path: Path, use: SensorSet | None, frame: str, wrong: dict[str, Any], instead: str
 ) -> None:
     convention = {"camera": frame == "camera"} | wrong
     if wrong == {"camera": None}:
         convention, instead = {"camera": frame == "body"}, f"{instead} {'camera' if frame == 'body' else 'body'}"
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), **convention)
+    file = written(tmp_path / "p.tum", drifted(), in_seconds(), **convention)
     if instead:
         with pytest.raises(RecordingError, match=f"does not fit ride as poses of the {frame}: .*; {instead}$"):
-            given(recording, GivenTrajectory(file, frame), use)
+            given(room_ride, GivenTrajectory(file, frame), use)
     else:
-        found = given(recording, GivenTrajectory(file, frame), use)
+        found = given(room_ride, GivenTrajectory(file, frame), use)
         assert f"trajectory p.tum (TUM): poses of the {frame}, scale 1:" in found.words
-        assert off_m(found, sample) < 0.02
+        assert off_m(found) < 0.02
 
 
 @pytest.mark.parametrize(
@@ -140,20 +124,20 @@ def test_a_wrong_convention_is_refused_with_the_one_that_fits(
     [lambda ns: f"{(ns - START_NS) / 10**9:.7f}", lambda ns: f"{(ns - START_NS) / 10**8:.1f}"],
     ids=["elapsed", "frames"],
 )
-def test_stamps_of_mast3r_and_dpv_slam_are_read(sample: Sample, recording: Path, tmp_path: Path, stamp: Any) -> None:
+def test_stamps_of_mast3r_and_dpv_slam_are_read(room_ride: Path, tmp_path: Path, stamp: Any) -> None:
     """Seconds since the first frame, and numbers of frames."""
-    stamps = [stamp(ns) for ns in sample.stamps_ns.tolist()]
-    file = written(tmp_path / "p.txt", drifted(sample), stamps, camera=True)
-    assert off_m(given(recording, GivenTrajectory(file)), sample) < 0.02
+    stamps = [stamp(ns) for ns in there_and_back().stamps_ns.tolist()]
+    file = written(tmp_path / "p.txt", drifted(), stamps, camera=True)
+    assert off_m(given(room_ride, GivenTrajectory(file))) < 0.02
 
 
 @pytest.mark.parametrize("stamps", [False, True], ids=["rows", "numbers"])
-def test_frames_that_are_damaged_count(sample: Sample, recording: Path, tmp_path: Path, stamps: bool) -> None:
+def test_frames_that_are_damaged_count(room_ride: Path, tmp_path: Path, stamps: bool) -> None:
     """A row for each frame, and numbers of frames: the other system has counted those too that are left out here."""
-    count = len(sample.stamps_ns)
+    count = len(there_and_back().stamps_ns)
     map_from_it = np.tile(np.eye(4), (count, 1, 1))
     rows = WrittenPoses("any", np.arange(count) * 1_000_000_000 if stamps else None, map_from_it)
-    with open_recording(recording) as opened:
+    with open_recording(room_ride) as opened:
         kept = np.delete(np.arange(count), 7)
         sound = replace(opened.part(kept), damaged_ns=opened.frame_stamps_ns[[7]])
         found = stamps_on_clock(rows, sound, np.arange(count - 1), GivenTrajectory(tmp_path / "p.txt"))
@@ -161,12 +145,12 @@ def test_frames_that_are_damaged_count(sample: Sample, recording: Path, tmp_path
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.3])
-def test_the_scale_is_found(sample: Sample, recording: Path, tmp_path: Path, scale: float) -> None:
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=scale)
-    found = given(recording, GivenTrajectory(file))
+def test_the_scale_is_found(room_ride: Path, tmp_path: Path, scale: float) -> None:
+    file = written(tmp_path / "p.tum", drifted(), in_seconds(), camera=True, scale=scale)
+    found = given(room_ride, GivenTrajectory(file))
     said = float(found.words.partition("scale ")[2].partition(":")[0])
     assert said * scale == pytest.approx(1.0, rel=0.02)
-    assert off_m(found, sample) < 0.03
+    assert off_m(found) < 0.03
 
 
 @pytest.mark.parametrize(("noise_m", "own_noise_m"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.05), (0.05, 0.05)])
@@ -183,55 +167,51 @@ def test_noise_of_neither_side_passes_for_another_scale(noise_m: float, own_nois
     assert (abs(np.log(scale)) <= within) == (metres == 1.0)
 
 
-def test_kitti_and_droid_are_read(sample: Sample, recording: Path, tmp_path: Path) -> None:
-    map_from_cam = drifted(sample) @ BODY_FROM_CAM0
+def test_kitti_and_droid_are_read(room_ride: Path, tmp_path: Path) -> None:
+    map_from_cam = drifted() @ BODY_FROM_CAM0
     np.savetxt(tmp_path / "p.txt", map_from_cam[:, :3].reshape(-1, 12))
-    assert off_m(given(recording, GivenTrajectory(tmp_path / "p.txt")), sample) < 0.02
+    assert off_m(given(room_ride, GivenTrajectory(tmp_path / "p.txt"))) < 0.02
     np.save(tmp_path / "poses.npy", pose_rows(se3_inverse(map_from_cam))[::2].astype(np.float32))
     np.save(tmp_path / "tstamps.npy", np.arange(0, FRAMES, 2, np.float64))
-    found = given(recording, GivenTrajectory(tmp_path))
+    found = given(room_ride, GivenTrajectory(tmp_path))
     assert "(DROID): poses of the camera" in found.words
-    assert off_m(found, sample) < 0.02
+    assert off_m(found) < 0.02
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
-def test_missing_poses_are_bridged_by_our_odometry(
-    sample: Sample, recording: Path, tmp_path: Path, use: SensorSet | None
-) -> None:
+def test_missing_poses_are_bridged_by_our_odometry(room_ride: Path, tmp_path: Path, use: SensorSet | None) -> None:
     """Every third one, a second in the middle, and both ends."""
     kept = [k for k in range(3, FRAMES - 4) if k % 3 and not 25 <= k < 36]
-    stamps = np.array(in_seconds(sample))[kept].tolist()
-    found = given(recording, GivenTrajectory(written(tmp_path / "p.tum", drifted(sample)[kept], stamps), "body"), use)
+    stamps = np.array(in_seconds())[kept].tolist()
+    found = given(room_ride, GivenTrajectory(written(tmp_path / "p.tum", drifted()[kept], stamps), "body"), use)
     assert "21 of 61 frames without a pose are bridged by our own odometry" in found.words
     assert len(found.trajectory) == FRAMES
-    assert off_m(found, sample) < 0.03
+    assert off_m(found) < 0.03
 
 
 def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
     still = ride_sample(lambda _: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.zeros(3)), 20, 0.1)
     folder = write_mcap(tmp_path / "still", still)
-    file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
+    file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds()[:20])
     with pytest.raises(UsageError, match="set its metres with --trajectory-scale METRES"):
         given(folder, GivenTrajectory(file, "body"), frames=20)
     assert "as stated" in given(folder, GivenTrajectory(file, "body", scale=1.0), frames=20).words
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
-def test_poses_of_another_recording_are_refused(
-    sample: Sample, recording: Path, tmp_path: Path, use: SensorSet | None
-) -> None:
+def test_poses_of_another_recording_are_refused(room_ride: Path, tmp_path: Path, use: SensorSet | None) -> None:
     other = ride_sample(out_and_back(3.5, yaw_rad=0.3), FRAMES, 0.1, begin_s=0.4)
-    file = written(tmp_path / "p.tum", np.array(other.world_from_body), in_seconds(sample))
+    file = written(tmp_path / "p.tum", np.array(other.world_from_body), in_seconds())
     with pytest.raises(RecordingError, match=r"another recording: .* off by \d+ % of"):
-        given(recording, GivenTrajectory(file, "body"), use)
-    late = [f"{stamp / 10**9 + 3600:.6f}" for stamp in sample.stamps_ns.tolist()]
+        given(room_ride, GivenTrajectory(file, "body"), use)
+    late = [f"{stamp / 10**9 + 3600:.6f}" for stamp in there_and_back().stamps_ns.tolist()]
     with pytest.raises(RecordingError, match="another recording: of its 61 poses"):
-        given(recording, GivenTrajectory(written(tmp_path / "q.tum", drifted(sample), late), "body"), use)
+        given(room_ride, GivenTrajectory(written(tmp_path / "q.tum", drifted(), late), "body"), use)
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
 def test_a_build_from_poses_makes_a_map_of_them(
-    sample: Sample, recording: Path, tmp_path: Path, use: SensorSet | None, monkeypatch: pytest.MonkeyPatch
+    room_ride: Path, tmp_path: Path, use: SensorSet | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Upright too, though the frame of the poses is not: by gravity, or by how the body began."""
     begun_with: list[int] = []
@@ -241,35 +221,35 @@ def test_a_build_from_poses_makes_a_map_of_them(
         return poses_as_odometry(given, *rest)
 
     monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun)
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=0.1)
+    file = written(tmp_path / "p.tum", drifted(), in_seconds(), camera=True, scale=0.1)
     options = BuildOptions(use=use, trajectory=GivenTrajectory(file), threads=1)
-    done = build_map(recording, tmp_path / "maps", "hall", options)
+    done = build_map(room_ride, tmp_path / "maps", "hall", options)
     assert done.report["ate_rmse_m"] < 0.02
     assert done.report["keyframes"] > 5
     assert begun_with == [FRAMES]
     (said,) = [words for words in done.report["findings"]["ride"] if words.startswith("trajectory p.tum (TUM)")]
     assert "poses of the camera" in said
     up = done.trajectory.frame_from_body[:, 2, :3]
-    true_up = np.array(sample.world_from_body)[:, 2, :3]
+    true_up = np.array(there_and_back().world_from_body)[:, 2, :3]
     assert np.arccos(np.clip(np.einsum("fi,fi->f", up, true_up), -1, 1)).max() < 0.01
 
 
-def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, recording: Path, tmp_path: Path) -> None:
+def test_frames_between_keyframes_lose_the_noise_of_the_file(room_ride: Path, tmp_path: Path) -> None:
     """Pictures place them: noise of 4 cm in every pose is not in the map's trajectory."""
     rng = np.random.default_rng(4)
-    noisy = [drift @ se3_exp(rng.normal(0, [3e-3] * 3 + [0.04] * 3)) for drift in drifted(sample)]
-    file = written(tmp_path / "p.tum", np.array(noisy), in_seconds(sample))
+    noisy = [drift @ se3_exp(rng.normal(0, [3e-3] * 3 + [0.04] * 3)) for drift in drifted()]
+    file = written(tmp_path / "p.tum", np.array(noisy), in_seconds())
     options = BuildOptions(use=SensorSet.STEREO, trajectory=GivenTrajectory(file, "body"), threads=1)
-    done = build_map(recording, tmp_path / "maps", "hall", options)
+    done = build_map(room_ride, tmp_path / "maps", "hall", options)
     assert done.report["keyframes"] < FRAMES / 2
     assert done.report["ate_rmse_m"] < 0.02
 
 
-def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp_path: Path) -> None:
-    write_tum(tmp_path / "half.tum", Trajectory(sample.stamps_ns[:28], drifted(sample)[:28]))
+def test_half_of_the_way_is_refused_by_name(room_ride: Path, tmp_path: Path) -> None:
+    write_tum(tmp_path / "half.tum", Trajectory(there_and_back().stamps_ns[:28], drifted()[:28]))
     with pytest.raises(UsageError, match=r"no pose for 33 of 61 frames of ride: \d+\.\d{9}, .* --frames"):
-        given(recording, GivenTrajectory(tmp_path / "half.tum", "body"))
-    assert len(given(recording, GivenTrajectory(tmp_path / "half.tum", "body"), frames=28).trajectory) == 28
+        given(room_ride, GivenTrajectory(tmp_path / "half.tum", "body"))
+    assert len(given(room_ride, GivenTrajectory(tmp_path / "half.tum", "body"), frames=28).trajectory) == 28
 
 
 @pytest.mark.parametrize(
@@ -285,30 +265,25 @@ def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp
         ("\udcff", "not a text file"),
     ],
 )
-def test_files_that_are_no_poses_are_refused(recording: Path, tmp_path: Path, content: str, said: str) -> None:
+def test_files_that_are_no_poses_are_refused(room_ride: Path, tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "p.txt").write_bytes(content.encode("utf-8", "surrogateescape"))
     with pytest.raises(RecordingError, match=said):
-        given(recording, GivenTrajectory(tmp_path / "p.txt"))
+        given(room_ride, GivenTrajectory(tmp_path / "p.txt"))
 
 
-def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -> None:
+def test_arrays_that_are_no_poses_are_refused(room_ride: Path, tmp_path: Path) -> None:
     """Objects are not unpacked, and a header that promises more than the file holds reserves nothing."""
     file = tmp_path / "poses.npy"
-    for array in (
-        np.array([{"a": 1}] * 7),
-        np.zeros((4, 5)),
-        np.zeros((9, 7)),
-        np.full((9, 7), np.nan),
-        np.array(["x"] * 9),
-    ):
+    objects, words = np.array([{"a": 1}] * 7), np.array(["x"] * 9)
+    for array in (objects, words, np.zeros((4, 5)), np.zeros((9, 7)), np.full((9, 7), np.nan)):
         np.save(file, array, allow_pickle=True)
         with pytest.raises(RecordingError, match=r"poses\.npy"):
-            given(recording, GivenTrajectory(file))
+            given(room_ride, GivenTrajectory(file))
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 7), }".ljust(117) + b"\n"
     for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00v\x00" + header, b"\x93NUMPY\x01\x00v\x00" + b"(" * 118):
         file.write_bytes(content)
         with pytest.raises(RecordingError, match="file of numbers"):
-            given(recording, GivenTrajectory(file))
+            given(room_ride, GivenTrajectory(file))
 
 
 @pytest.mark.parametrize(
@@ -321,15 +296,15 @@ def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -
     ],
 )
 def test_what_does_not_fit_is_refused(
-    sample: Sample, recording: Path, tmp_path: Path, change: dict[str, object], use: SensorSet | None, said: str
+    room_ride: Path, tmp_path: Path, change: dict[str, object], use: SensorSet | None, said: str
 ) -> None:
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
+    file = written(tmp_path / "p.tum", drifted(), in_seconds())
     with pytest.raises(FleetmapError, match=said):
-        given(recording, GivenTrajectory(**{"file": file} | change), use)  # type: ignore[arg-type]
+        given(room_ride, GivenTrajectory(**{"file": file} | change), use)  # type: ignore[arg-type]
 
 
-def test_one_file_belongs_to_one_recording(sample: Sample, recording: Path, tmp_path: Path) -> None:
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
+def test_one_file_belongs_to_one_recording(room_ride: Path, tmp_path: Path) -> None:
+    file = written(tmp_path / "p.tum", drifted(), in_seconds())
     options = BuildOptions(trajectory=GivenTrajectory(file, "body"))
     with pytest.raises(UsageError, match="is for one recording, 2 are named"):
-        build_map([recording, recording], tmp_path / "maps", "hall", options)
+        build_map([room_ride, room_ride], tmp_path / "maps", "hall", options)

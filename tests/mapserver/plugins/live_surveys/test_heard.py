@@ -1,6 +1,5 @@
 """Surveys under way, as the server hears of them over the bus, and what they lack."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -20,7 +19,7 @@ from mapserver.serving.bus_service import BusService
 from support.fleet.hostile_messages import check_refusals, extremes, structs_of
 from support.fleet.memory_bus import MemoryBus
 from support.fleet.served_api import served_api
-from support.fleet.served_world import World, served_world
+from support.fleet.served_world import World
 
 
 def state(site: str = "hall", **changed: object) -> LiveSurveyState:
@@ -35,12 +34,6 @@ def state(site: str = "hall", **changed: object) -> LiveSurveyState:
 
 def take(surveys: LiveSurveys, told: LiveSurveyState) -> None:
     surveys.hear(live_key(told.site), encode_message(told))
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with served_world(tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from click.testing import Result
 from rich.console import Console
-from typer.testing import CliRunner
 
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, UsageError
 from fleetmap.geometry import transform_points
@@ -27,6 +25,7 @@ from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import Call, MappingHere, laid_on_truth, order_builds, write_rgbd
 from support.recordings.recording_samples import calibration, kalibr_text, write_mcap
+from support.room_site import invoke
 from support.worlds import robot_world
 from support.worlds.box_room import ROOM_M
 
@@ -70,16 +69,12 @@ def configured(tmp_path: Path, site: Site, kind: SensorSet, more: str = "") -> P
     return file
 
 
-def run(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_live_and_build_take_one_configuration_file(
     site: Site, tmp_path: Path, builds: list[Call], kind: SensorSet
 ) -> None:
     file, recording = configured(tmp_path, site, kind), site.recording(kind)
-    done = run("live", recording, "--config", file)
+    done = invoke(app, "live", recording, "--config", file)
     assert done.exit_code == 0, done.exception
     made = MappingHere.made
     if kind in METRIC:
@@ -92,7 +87,7 @@ def test_live_and_build_take_one_configuration_file(
     assert [part.is_map for part in found.parts] == [True]
     assert found.estimate.status == "TRACKING"
     assert ("scale: unknown" in done.stderr) is (kind is SensorSet.MONO)
-    assert run("build", recording, "--config", file).exit_code == 0
+    assert invoke(app, "build", recording, "--config", file).exit_code == 0
     (_, *live_at, by_live), (_, *build_at, by_build) = builds
     assert live_at == build_at
     assert by_live.settings == survey_settings(file, kind)
@@ -134,7 +129,7 @@ def test_what_a_build_would_refuse_is_refused_before_the_drive(
         ((blind, "--use", "rgbd"), RecordingError, "depth: 100.0% of the pixels have no depth"),
     ]
     for words, kind, message in cases:
-        done = run("live", *words, "--config", config)
+        done = invoke(app, "live", *words, "--config", config)
         assert isinstance(done.exception, kind), words
         assert message in str(done.exception)
 
@@ -201,7 +196,7 @@ def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_pa
     more = f'[source]\nkind = "recording"\nrecording = "{site.depths}"\nspeed = 0.0\n'
     file = configured(tmp_path, site, SensorSet.RGBD, more)
     file.write_text(file.read_text().replace('[live]\nspeed = 0.0\nuse = "rgbd"\n', f'[live]\nrecord = "{record}"\n'))
-    done = run("live", "--config", file)
+    done = invoke(app, "live", "--config", file)
     assert done.exit_code == 0, done.exception
     ((path, _, name, options),) = builds
     assert (path, name, options.frames) == (record, "lab", "::")
@@ -210,6 +205,6 @@ def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_pa
     with kept:
         assert (kept.sensor_set, len(indices)) == (SensorSet.RGBD, len(robot_world.cycle().stamps_ns))
     for option, value in (("--use", "stereo"), ("--calibration", file), ("--topic", "imu=/a")):
-        refused = run("live", "--config", file, option, value)
+        refused = invoke(app, "live", "--config", file, option, value)
         assert isinstance(refused.exception, UsageError)
         assert "[source]" in str(refused.exception)

@@ -57,6 +57,17 @@ def is_shown(server: FoxgloveServer) -> bool:
     return server._channels["/fixes"].has_sinks()
 
 
+@contextmanager
+def looking(server: FoxgloveServer) -> Iterator[FoxgloveClient]:
+    """The first viewer that looks at fixes."""
+    assert not is_shown(server)
+    with FoxgloveClient(server.url) as viewer:
+        viewer.subscribe(["/fixes"])
+        while not is_shown(server):
+            time.sleep(0.01)
+        yield viewer
+
+
 def test_viewers_get_what_stands_there_and_what_comes(server: FoxgloveServer) -> None:
     server.show([Shown.now(channels.points(5, POINTS))])
     with FoxgloveClient(server.url) as first, FoxgloveClient(server.url) as second:
@@ -98,11 +109,7 @@ def test_a_message_that_cannot_be_made_ends_nothing(server: FoxgloveServer) -> N
     def broken() -> ChannelMessage:
         raise ZeroDivisionError
 
-    assert not is_shown(server)
-    with FoxgloveClient(server.url) as viewer:
-        viewer.subscribe(["/fixes"])
-        while not is_shown(server):
-            time.sleep(0.01)
+    with looking(server) as viewer:
         server.show([Shown("/fixes", 1, damaged), Shown("/fixes", 2, broken), place(3)])
         assert viewer.wait_for("/fixes")[0][0] == 3
 
@@ -141,7 +148,7 @@ def test_a_viewer_that_hangs_keeps_nobody_waiting() -> None:
                 hanging.stdout.close()
 
 
-def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
+def test_what_comes_too_quickly_is_dropped_and_counted(server: FoxgloveServer) -> None:
     release = []
 
     def slow() -> ChannelMessage:
@@ -149,18 +156,13 @@ def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
             time.sleep(0.01)
         return channels.place("/fixes", 1, np.eye(4))
 
-    with FoxgloveServer(*FREE, "hall") as server:
-        assert not is_shown(server)
-        with FoxgloveClient(server.url) as viewer:
-            viewer.subscribe(["/fixes"])
-            while not is_shown(server):
-                time.sleep(0.01)
-            server.show([Shown("/fixes", 1, slow)])
-            time.sleep(0.2)
-            server.show(place(stamp_ns) for stamp_ns in range(2, 102))
-            assert server.dropped == 100 - 32
-            release.append(True)
-            assert [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", 33)] == [1, *range(70, 102)]
+    with looking(server) as viewer:
+        server.show([Shown("/fixes", 1, slow)])
+        time.sleep(0.2)
+        server.show(place(stamp_ns) for stamp_ns in range(2, 102))
+        assert server.dropped == 100 - 32
+        release.append(True)
+        assert [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", 33)] == [1, *range(70, 102)]
 
 
 def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
@@ -208,12 +210,9 @@ def test_addresses() -> None:
 def live(recording: Path, store: Path, *given: str) -> Iterator[FoxgloveClient]:
     """What a viewer sees of a survey, which must end well."""
     words = ["live", str(recording), "--site", "lab", "--store", str(store), "--foxglove", "0", *given]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mapserver.cli", *words],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-m", "mapserver.cli", *words]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     try:
         url = process.stdout.readline().removeprefix("foxglove: ").strip()
         with FoxgloveClient(url, within_s=240.0) as viewer:

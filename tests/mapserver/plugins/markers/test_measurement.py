@@ -37,14 +37,11 @@ def survey(stretch: float, last_m: float = 10.0) -> tuple[Any, Trajectory]:
     truth += [se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([x_m, 0.0, 0.0])) for x_m in np.linspace(0.5, 1.5, 6)]
     rng = np.random.default_rng(0)
     camera = Rectifier(rig()).camera
-    frames = [painted(camera, map_from_body @ se3(FORWARD, np.zeros(3)), THERE, SIZE_M, rng) for map_from_body in truth]
+    images = [painted(camera, map_from_body @ se3(FORWARD, np.zeros(3)), THERE, SIZE_M, rng) for map_from_body in truth]
     stamps = STEP_NS * np.arange(len(truth))
-    recording = SimpleNamespace(
-        name="drive",
-        calibration=rig(),
-        frame_stamps_ns=stamps,
-        read_frame=lambda n: CameraFrame(int(stamps[n]), frames[n], frames[n]),
-    )
+    frames = [CameraFrame(stamp_ns, image, image) for stamp_ns, image in zip(stamps.tolist(), images, strict=True)]
+    shown = {"frame_stamps_ns": stamps, "read_frame": frames.__getitem__}
+    recording = SimpleNamespace(name="drive", calibration=rig(), **shown)
     estimated = np.array(truth)
     estimated[:, :3, 3] *= stretch
     return recording, Trajectory(stamps, estimated)

@@ -41,12 +41,14 @@ from mapserver.plugins.nightly_builds.night import NightReport, NightRequest, la
 from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify, read
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, FleetRetention, MapStore
+from mapserver.store.files import locked
 from mapserver.survey.settings import SurveySettings
 from support.command_line import status
 from support.fleet.contracts_documents import code_words, rows, section
 from support.recordings.recording_samples import Sample, make_sample, write_euroc, write_mcap
 from support.storage.faulty_disk import Disk, in_child
 from support.storage.map_samples import draft_details, random_tile
+from support.waiting import within_another_process
 
 LATER_NS = 3_600 * 10**9
 READ = recordings._read
@@ -508,21 +510,9 @@ def test_half_copied_recordings_wait(tmp_path: Path) -> None:
 def test_one_night_at_a_time_and_a_dead_one_holds_nothing(hall: Path) -> None:
     with MapStore.open(hall / "store", create=True):
         pass
-    told, tell = os.pipe()
-    child = os.fork()
-    if child == 0:
-        descriptor = os.open(hall / "store/nightly-hall.lock", os.O_RDWR | os.O_CREAT)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        os.write(tell, b"x")
-        signal.pause()
-        os._exit(0)
-    os.read(told, 1)
-    try:
-        with pytest.raises(BusyError, match="holds"):
-            spend(hall)
-    finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+    lock = hall / "store/nightly-hall.lock"
+    with within_another_process(locked, lock, shared=False), pytest.raises(BusyError, match="holds"):
+        spend(hall)
     with MapStore.open(hall / "store") as maps:
         assert maps.jobs("hall") == []
     assert "version 1 published" in spend(hall)

@@ -2,18 +2,15 @@
 
 import json
 import shlex
-import sys
 from pathlib import Path
 
-import pytest
-
-from mapserver import cli
 from mapserver.store import MapStore
+from support.command_line import status
 from support.recordings.recording_samples import write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
 
 
-def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_nights(tmp_path: Path) -> None:
     """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first.
 
     The second inherits the trust of the first one's calibration.
@@ -23,19 +20,14 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number, ride in enumerate(rides, 1):
         write_mcap(inbox / f"ride{number}", ride_sample(ride, 38, 0.1, seed=number))
         words = f"mapserver nightly --site lab --inbox {inbox} --store {tmp_path}/store --settle-s 0 --report {report}"
-        monkeypatch.setattr(sys, "argv", shlex.split(words))
-        with pytest.raises(SystemExit) as end:
-            cli.main()
+        ended = status(*shlex.split(words))
         said = json.loads(report.read_text())
         if number == 1:  # too short to judge its calibration: a person decides, as the refusal says
-            assert (end.value.code, [r["fate"] for r in said["recordings"]]) == (4, ["held"])
+            assert (ended, [r["fate"] for r in said["recordings"]]) == (4, ["held"])
             command = said["recordings"][0]["reason"].rpartition("mapserver ")[2].replace("WHY", "a known rig")
-            monkeypatch.setattr(sys, "argv", ["mapserver", *shlex.split(command)])
-            with pytest.raises(SystemExit) as end:
-                cli.main()
-            assert not end.value.code
+            assert status("mapserver", *shlex.split(command)) == 0
             continue
-        assert not end.value.code, said
+        assert ended == 0, said
         assert (said["published"], [r["fate"] for r in said["recordings"]]) == ([number], ["done"])
     with MapStore.open(tmp_path / "store") as maps:
         first, second = (maps.evidence("lab", version) for version in (1, 2))

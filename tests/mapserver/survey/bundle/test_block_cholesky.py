@@ -44,12 +44,9 @@ def problem(pairs: Sequence[tuple[int, int]], kind: str = "poses", count: int = 
     rng = np.random.default_rng(1)
     map_from_body = np.array([se3_exp(0.3 * step) for step in rng.normal(size=(count, 6))])
     roots = rng.normal(size=(count + len(pairs), 6, 6))
-    relative = [
-        RelativeTerm(
-            i, j, se3_inverse(map_from_body[i]) @ map_from_body[j] @ se3_exp(0.1 * rng.normal(size=6)), root @ root.T
-        )
-        for (i, j), root in zip(pairs, roots[count:], strict=True)
-    ]
+    steps = [se3_inverse(map_from_body[i]) @ map_from_body[j] @ se3_exp(0.1 * rng.normal(size=6)) for i, j in pairs]
+    told = zip(pairs, steps, roots[count:], strict=True)
+    relative = [RelativeTerm(i, j, step, root @ root.T) for (i, j), step, root in told]
     priors = [PriorTerm(k, map_from_body[k], roots[k] @ roots[k].T + np.eye(6)) for k in range(count)]
     moved = {"map_from_body": map_from_body, "fixed": np.zeros(count, np.bool_), "relative": relative, "priors": priors}
     terms = replace(SCENE.observed(np.zeros(len(SCENE.obs_pixels), np.bool_)), **moved, inertial=None)

@@ -39,13 +39,8 @@ def test_recovers_the_truth(dense_unknowns: int) -> None:
 
 
 def test_leaves_the_problem_untouched_and_repeats_itself() -> None:
-    start = disturbed(
-        make_scene(keyframes=5, landmarks=80, step_s=0.4, seed=1).problem,
-        seed=2,
-        rot_rad=0.02,
-        trans_m=0.1,
-        points_m=0.1,
-    )
+    truth = make_scene(keyframes=5, landmarks=80, step_s=0.4, seed=1).problem
+    start = disturbed(truth, seed=2, rot_rad=0.02, trans_m=0.1, points_m=0.1)
     before = start.map_from_body.copy(), start.points_map.copy()
     first, second = optimize(start, BundleSettings()), optimize(start, BundleSettings())
     np.testing.assert_array_equal(start.map_from_body, before[0])
@@ -127,10 +122,8 @@ def test_relative_terms_carry_over_missing_vision() -> None:
     start = disturbed(truth, seed=3, rot_rad=0.02, trans_m=0.1, points_m=0.05)
     blind = start.obs_keyframe != 3
     map_from_body = truth.map_from_body
-    terms = [
-        RelativeTerm(i, j, se3_inverse(map_from_body[i]) @ map_from_body[j], 1e4 * np.eye(6))
-        for i, j in ((2, 3), (4, 3))
-    ]
+    steps = {(i, j): se3_inverse(map_from_body[i]) @ map_from_body[j] for i, j in ((2, 3), (4, 3))}
+    terms = [RelativeTerm(*pair, i_from_j, 1e4 * np.eye(6)) for pair, i_from_j in steps.items()]
     problem = replace(start.observed(blind), relative=terms)
     np.testing.assert_allclose(optimize(problem, PRECISE).map_from_body, map_from_body, atol=1e-5)
 

@@ -16,27 +16,17 @@ FRONT_AND_REAR = np.stack([np.eye(4), se3_exp(np.array([0.01, 0.02, np.pi, -0.4,
 
 
 def _problem(*, inertial: bool, body_from_others: Array = ONE) -> BundleProblem:
-    scene = make_scene(
-        keyframes=5,
-        landmarks=40,
-        step_s=0.4,
-        seed=3,
-        noise_px=1.0,
-        inertial=inertial,
-        body_from_others=body_from_others,
-    )
+    what = {"inertial": inertial, "body_from_others": body_from_others}
+    scene = make_scene(keyframes=5, landmarks=40, step_s=0.4, seed=3, noise_px=1.0, **what)
     problem = disturbed(scene.problem, seed=4, rot_rad=0.01, trans_m=0.05, points_m=0.05)
     rng = np.random.default_rng(7)
     root = rng.normal(size=(6, 6))
     map_from_body = problem.map_from_body
     for i, j in ((1, 4), (3, 0)):
-        off = se3_exp(rng.normal(size=6) * 0.05)
-        problem.relative.append(
-            RelativeTerm(i, j, se3_inverse(map_from_body[i]) @ map_from_body[j] @ off, root @ root.T + np.eye(6))
-        )
-    problem.priors.append(
-        PriorTerm(2, map_from_body[2] @ se3_exp(rng.normal(size=6) * 0.05), root.T @ root + np.eye(6))
-    )
+        i_from_j = se3_inverse(map_from_body[i]) @ map_from_body[j] @ se3_exp(rng.normal(size=6) * 0.05)
+        problem.relative.append(RelativeTerm(i, j, i_from_j, root @ root.T + np.eye(6)))
+    place = map_from_body[2] @ se3_exp(rng.normal(size=6) * 0.05)
+    problem.priors.append(PriorTerm(2, place, root.T @ root + np.eye(6)))
     if problem.inertial is not None:
         problem.inertial.motions += rng.normal(size=(5, 9)) * np.repeat([0.1, 0.01, 0.1], 3)
         mean, sigma = rng.normal(size=9) * 0.1, np.array([np.inf] * 3 + [0.01] * 3 + [0.1] * 3)

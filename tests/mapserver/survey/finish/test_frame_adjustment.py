@@ -54,13 +54,8 @@ def drive(kind: str = "stereo", blind: range = range(0), slipped: float = 0.0) -
         motion = replace(motion, inertial=True, imu=felt(given.map_from_body), noise=ImuNoise())
     kept = marks.keep_observations(np.isin(marks.obs_keyframe, KEYFRAMES), 1)
     kept = replace(kept, obs_keyframe=np.searchsorted(KEYFRAMES, kept.obs_keyframe).astype(np.int32))
-    state = replace(
-        given.state,
-        rig=replace(given.state.rig, camera=camera),
-        motion=motion,
-        landmarks=kept,
-        map_from_body=given.map_from_body[KEYFRAMES],
-    )
+    changed = {"rig": replace(given.state.rig, camera=camera), "motion": motion, "landmarks": kept}
+    state = replace(given.state, **changed, map_from_body=given.map_from_body[KEYFRAMES])
     odom_from_map = se3_exp(np.array([0.0, 0.0, 0.7, 3.0, -2.0, 1.0]))
     odometry = OdometryPass(
         [SimpleNamespace(stamp_ns=f * FRAME_NS) for f in range(FRAMES)],

@@ -39,13 +39,11 @@ def tracks_seen_by(who: list[list[int]]) -> Tracks:
 
 def drive(laps: int, places: int, per_place: int = 20) -> Tracks:
     """Laps past some places; what stands at a place is seen from it and from the next two."""
-    return tracks_seen_by(
-        [
-            sorted(lap * places + (place + ahead) % places for lap in range(laps) for ahead in range(3))
-            for place in range(places)
-            for _ in range(per_place)
-        ]
-    )
+
+    def who(place: int) -> list[int]:
+        return sorted(lap * places + (place + ahead) % places for lap in range(laps) for ahead in range(3))
+
+    return tracks_seen_by([who(place) for place in range(places) for _ in range(per_place)])
 
 
 def test_of_many_laps_the_first_ones_are_left() -> None:

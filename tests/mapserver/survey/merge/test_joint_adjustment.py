@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +52,11 @@ def shelves(rng: np.random.Generator) -> tuple[Array, Any]:
     return points, rng.random(len(points)) < 0.3
 
 
-def places(corners: list[tuple[float, float]]) -> Array:
+Ways = list[tuple[float, float]]
+UNPUBLISHED: Any = None  # such a map takes part by what is known of it alone
+
+
+def places(corners: Ways) -> Array:
     """(K, 4, 4) every half metre and ten degrees on the way from corner to corner, looking ahead."""
     found, heading = [], None
     for (x0, y0), (x1, y1) in pairwise(corners):
@@ -68,9 +72,18 @@ def places(corners: list[tuple[float, float]]) -> Array:
     return np.array(found)
 
 
-def drive(
-    points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: np.random.Generator, others: Array = ONE
-) -> Drive:
+def driven(
+    seed: int, first: Ways, later: Ways | None = None, *others: Array
+) -> tuple[Drive, Drive, Measured, Sightings]:
+    """Two drives between shelves, by default the same way and with one pair; with what holds the first one's map, and is seen of it."""
+    rng = np.random.default_rng(seed)
+    points, at_edge = shelves(rng)
+    rigs = others or (ONE, ONE)
+    one, other = (drive(points, at_edge, way, rng, rig) for way, rig in zip((first, later or first), rigs, strict=True))
+    return one, other, *beside(one, other)
+
+
+def drive(points: Array, at_edge: Any, corners: Ways, rng: np.random.Generator, others: Array = ONE) -> Drive:
     """A drive's survey: planes' disparities are good to 0.06 px, those at far depth edges too large and never too small."""
     truth, cameras = places(corners), rig(others, CAMERA, BODY_FROM_CAM)
     image, which, pixels = [], [], []
@@ -110,24 +123,20 @@ def ate_m(true: Array, found: Array) -> float:
     return absolute_trajectory_error(*(Trajectory(np.arange(len(each)), each) for each in (found, true))).rmse_m
 
 
-def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, Sightings]:
+def beside(first: Drive, later: Drive) -> tuple[Measured, Sightings]:
     """What holds the first drive's map, and what the later one sees of it."""
     known = Measured(
         bundle_problem(first.state, SETTINGS, None),
         *np.indices((len(first.map_from_body), len(first.state.rig))).reshape(2, -1),
         np.arange(len(first.points)),
     )
-    row = np.full(points, -1)
+    row = np.full(max(first.points.max(), later.seen.max()) + 1, -1)
     row[first.points] = np.arange(len(first.points))
     features = np.flatnonzero(row[later.seen] >= 0)
     features = features[np.argsort(later.seen_by[features], kind="stable")]
-    located, sigmas = (
-        np.ones(len(later.map_from_body) * len(later.state.rig), bool),
-        np.tile(CLAIMED_PX, (len(features), 1)),
-    )
-    return known, Sightings(
-        located, later.seen_by[features], row[later.seen[features]], features, later.pixels[features], sigmas
-    )
+    located = np.ones(len(later.map_from_body) * len(later.state.rig), bool)
+    what = later.seen_by[features], row[later.seen[features]], features, later.pixels[features]
+    return known, Sightings(located, *what, np.tile(CLAIMED_PX, (len(features), 1)))
 
 
 def by(camera: StereoCamera, made: Drive) -> Drive:
@@ -143,19 +152,17 @@ def by(camera: StereoCamera, made: Drive) -> Drive:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_joined_drive_is_as_good_as_alone_and_the_map_stays(seed: int) -> None:
     """The survey's own last round keeps depth edges from pulling its scale; joining must not bring them back."""
-    rng = np.random.default_rng(seed)
-    points, at_edge = shelves(rng)
     y, end = [0.0, AISLES_M, 2 * AISLES_M], LENGTH_M + 1
-    first = drive(points, at_edge, [(-2, y[1]), (-2, y[0]), (end, y[0]), (end, y[1]), (-2, y[1]), (-2, y[0])], rng)
-    later = drive(points, at_edge, [(-2, y[0]), (-2, y[1]), (end, y[1]), (end, y[2]), (-2, y[2]), (-2, y[1])], rng)
-    known, sightings = beside(first, later, len(points))
-    lies = rigid(first.state.map_from_body[:, :3, 3], first.map_from_body[:, :3, 3]) @ rigid(
-        later.map_from_body[:, :3, 3], later.state.map_from_body[:, :3, 3]
+    ways = (
+        [(-2, y[1]), (-2, y[0]), (end, y[0]), (end, y[1]), (-2, y[1]), (-2, y[0])],
+        [(-2, y[0]), (-2, y[1]), (end, y[1]), (end, y[2]), (-2, y[2]), (-2, y[1])],
     )
-    base: Any = None  # a map that is not published takes part by what is known of it alone
-    start = lies @ later.state.map_from_body
-    rough = adjust_jointly(base, known, later.state, start, sightings, SETTINGS, finely=False)
-    joint = adjust_jointly(base, known, later.state, rough.map_from_body, sightings, SETTINGS, finely=True)
+    first, later, known, sightings = driven(seed, *ways)
+    first_from_truth = rigid(first.state.map_from_body[:, :3, 3], first.map_from_body[:, :3, 3])
+    truth_from_later = rigid(later.map_from_body[:, :3, 3], later.state.map_from_body[:, :3, 3])
+    start = first_from_truth @ truth_from_later @ later.state.map_from_body
+    rough = adjust_jointly(UNPUBLISHED, known, later.state, start, sightings, SETTINGS, finely=False)
+    joint = adjust_jointly(UNPUBLISHED, known, later.state, rough.map_from_body, sightings, SETTINGS, finely=True)
     drives = (first, joint.base_from_body), (later, joint.map_from_body)
     alone_m = sum(ate_m(each.map_from_body, each.state.map_from_body) for each, _ in drives)
     joined_m = sum(ate_m(each.map_from_body, found) for each, found in drives)
@@ -166,13 +173,10 @@ def test_a_joined_drive_is_as_good_as_alone_and_the_map_stays(seed: int) -> None
 
 @pytest.mark.parametrize(("map_m", "survey_m"), [(0.12, 0.0), (0.0, 0.12), (0.0, 0.0)])
 def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: float) -> None:
-    rng = np.random.default_rng(1)
-    points, at_edge = shelves(rng)
-    drives = (drive(points, at_edge, [(-2, 0), (6, 0)], rng) for _ in range(2))
+    drives = driven(1, [(-2, 0), (6, 0)])[:2]
     first, later = (by(replace(CAMERA, baseline_m=m), each) for m, each in zip((map_m, survey_m), drives, strict=True))
-    known, sightings = beside(first, later, len(points))
-    base: Any = None
-    joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
+    known, sightings = beside(first, later)
+    joint = adjust_jointly(UNPUBLISHED, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     assert joint.measured.problem.rig.camera.baseline_m == max(map_m, survey_m)
     assert np.linalg.norm((joint.map_from_body - later.map_from_body)[:, :3, 3], axis=1).max() < 0.1
 
@@ -180,14 +184,9 @@ def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: floa
 @pytest.mark.parametrize("of_map", [[], [REAR]])
 @pytest.mark.parametrize("of_survey", [[], [REAR], [ASIDE]])
 def test_rigs_with_different_views_join_each_other(of_map: list[Array], of_survey: list[Array]) -> None:
-    rng = np.random.default_rng(3)
-    points, at_edge = shelves(rng)
     map_others, survey_others = (np.array([np.eye(4), *others]) for others in (of_map, of_survey))
-    first = drive(points, at_edge, [(-2, 0), (6, 0)], rng, map_others)
-    later = drive(points, at_edge, [(-2, 0), (6, 0)], rng, survey_others)
-    known, sightings = beside(first, later, len(points))
-    base: Any = None
-    joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
+    first, later, known, sightings = driven(3, [(-2, 0), (6, 0)], None, map_others, survey_others)
+    joint = adjust_jointly(UNPUBLISHED, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     assert len(joint.measured.problem.rig) == 1 + len({id(view) for view in (*of_map, *of_survey)})
     for found, truth in (
         (joint.map_from_body, later.map_from_body),
@@ -218,12 +217,10 @@ def bent(made: Drive, first: int, yaw_rad: float) -> SurveyState:
     points = np.concatenate([marks.points_map, transform_points(turned, marks.points_map)])[used]
     order = np.argsort(number, kind="stable")
     marks = marks.taken(order, points, marks.obs_keyframe[order], number[order])
-    step = RelativeTerm(
-        first - 1, first, se3_inverse(last) @ placed[first], np.diag([1 / 0.1**2] * 3 + [1 / 0.03**2] * 3)
-    )
-    return replace(
-        made.state, map_from_body=placed, landmarks=marks, motion=replace(made.state.motion, relative=[step])
-    )
+    information = np.diag([1 / 0.1**2] * 3 + [1 / 0.03**2] * 3)
+    step = RelativeTerm(first - 1, first, se3_inverse(last) @ placed[first], information)
+    motion = replace(made.state.motion, relative=[step])
+    return replace(made.state, map_from_body=placed, landmarks=marks, motion=motion)
 
 
 def test_two_docks_hold_a_block_whose_yaw_drifts() -> None:
@@ -242,15 +239,11 @@ def test_two_docks_hold_a_block_whose_yaw_drifts() -> None:
 
 
 def test_a_dock_that_contradicts_the_survey_is_not_obeyed() -> None:
-    rng = np.random.default_rng(4)
-    points, at_edge = shelves(rng)
-    first, later = (drive(points, at_edge, [(-2, 0), (8, 0)], rng) for _ in range(2))
-    known, sightings = beside(first, later, len(points))
-    known, base = replace(known, map_from_docks=np.eye(4)), cast(Any, None)
-    found = {}
+    first, later, known, sightings = driven(4, [(-2, 0), (8, 0)])
+    known, found = replace(known, map_from_docks=np.eye(4)), {}
     for name, priors in (("none", []), ("right", docked(later, [0, 10])), ("wrong", docked(later, [0, 10], 0.3))):
         state = replace(later.state, priors=priors)
-        joint = adjust_jointly(base, known, state, later.map_from_body, sightings, SETTINGS, finely=True)
+        joint = adjust_jointly(UNPUBLISHED, known, state, later.map_from_body, sightings, SETTINGS, finely=True)
         found[name] = joint.map_from_body
         believed = [term.k - len(first.map_from_body) for term in joint.measured.problem.priors]
         assert believed == {"none": [], "right": [0, 10], "wrong": [0]}[name]
@@ -260,16 +253,14 @@ def test_a_dock_that_contradicts_the_survey_is_not_obeyed() -> None:
 
 def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
     """The map lies as its first dock says, a degree off; the later drive's docks fit after one turn of all, and so are believed."""
-    rng = np.random.default_rng(5)
-    points, at_edge = shelves(rng)
-    first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 2, 0)], rng) for _ in range(2))
+    first, later, _, _ = driven(5, [(-2, 0), (LENGTH_M - 2, 0)])
     off = se3(so3_exp(np.array([0, 0, np.radians(1.0)])), np.zeros(3))
     state = replace(first.state, priors=docked(first, [0])).transformed(off)
-    known, sightings = beside(replace(first, state=state), later, len(points))
-    known, base = replace(known, map_from_docks=np.eye(4)), cast(Any, None)
+    known, sightings = beside(replace(first, state=state), later)
+    known = replace(known, map_from_docks=np.eye(4))
     start = off @ later.state.map_from_body
     there = replace(later.state, priors=docked(later, [0, len(start) - 1]))
-    joint = adjust_jointly(base, known, there, start, sightings, SETTINGS, finely=True)
+    joint = adjust_jointly(UNPUBLISHED, known, there, start, sightings, SETTINGS, finely=True)
     assert joint.priors_refused == 0
     assert np.linalg.norm((joint.base_from_body - state.map_from_body)[:, :3, 3], axis=1).max() < 0.006
     aside_m = (se3_inverse(off) @ joint.map_from_body - later.map_from_body)[:, 1, 3]  # along the way depth edges count
@@ -292,7 +283,7 @@ def test_a_published_map_is_held_by_all_that_it_knows_of_itself(sees: str) -> No
     rng = np.random.default_rng(6 if sees == "little" else 7)
     points, at_edge = shelves(rng)
     first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 4, 0)], rng) for _ in range(2))
-    _, sightings = beside(first, later, len(points))
+    _, sightings = beside(first, later)
     if sees == "little":
         few = rng.random(len(points)) < 1 / 12
         sightings = sightings.only(few[sightings.rows])

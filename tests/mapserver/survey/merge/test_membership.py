@@ -38,13 +38,12 @@ def joined(test: MembershipTest) -> SessionPlace:
     return located
 
 
-def restocked(share: float, seed: int) -> Aisle:
-    """Home with a share of its half metres of shelf changed."""
-    shelf = np.floor(HOME.points_map * 2.0).astype(np.int64)
+def restocked(share: float, seed: int, stock: int, shelves: Aisle = HOME) -> Aisle:
+    """Shelves of which a share of the half metres has another stock."""
+    shelf = np.floor(shelves.points_map * 2.0).astype(np.int64)
     _, number = np.unique(shelf, axis=0, return_inverse=True)
-    rng = np.random.default_rng(seed)
-    changed = rng.random(number.max() + 1) < share
-    return repainted(HOME, aisle(50 + seed), changed[number.reshape(-1)])
+    changed = np.random.default_rng(seed).random(number.max() + 1) < share
+    return repainted(shelves, aisle(stock), changed[number.reshape(-1)])
 
 
 def shared_above(height_m: float) -> Aisle:
@@ -65,7 +64,7 @@ def docks(metres: float = 0.0) -> Array:
 @pytest.mark.parametrize("share", [0.3])
 def test_a_session_of_the_site_is_joined_where_it_is(share: float) -> None:
     for given in (None, docks()):
-        located = joined(membership(KNOWN, restocked(share, 3), PLACES, given))
+        located = joined(membership(KNOWN, restocked(share, 3, 53), PLACES, given))
         assert located.placed.places >= 8
         assert np.linalg.norm((located.map_from_body - PLACES)[:, :3, 3], axis=1).max() < 0.03
 
@@ -87,7 +86,7 @@ AROUND = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
         # Another building may as well be an aisle of the site the other way round, where the map was not: none of it is foreign.
         (lambda: shared_above(1.2), PLACES, None, "elsewhere, or where or in a direction"),
         (lambda: HOME, PLACES[::-1] @ AROUND, PLACES[-1] @ AROUND, ""),
-        (lambda: restocked(0.65, 4), PLACES, None, "not certain"),
+        (lambda: restocked(0.65, 4, 54), PLACES, None, "not certain"),
         (lambda: aisle(9), PLACES, None, "not found in the map"),
         (lambda: aisle(9), PLACES, docks(), "not found in the map"),
         (lambda: aisle(9), PLACES, docks(7.0), "not found in the map"),
@@ -161,27 +160,24 @@ def test_what_the_map_saw_through_racks_is_not_asked_of_an_aisle_that_it_never_w
     known = relocalizer(together(HOME, backs), drive(56))
     shown = [together(HOME if is_there else aisle(9), backs)] * 10 + [fronts] * 50
     places = np.concatenate([drive(10, start_m=19.0), drive(50, start_m=3.0, y_m=3.2)])
-    said, located = verdict(membership(known, shown, places, places[0]))
-    assert (said is MembershipVerdict.JOINED) == is_there
+    test = membership(known, shown, places, places[0])
     if is_there:
-        assert isinstance(located, SessionPlace)
-        assert np.linalg.norm((located.map_from_body - places)[:10, :3, 3], axis=1).max() < 0.03
+        assert np.linalg.norm((joined(test).map_from_body - places)[:10, :3, 3], axis=1).max() < 0.03
+    else:
+        assert verdict(test)[0] is not MembershipVerdict.JOINED
 
 
 @pytest.mark.parametrize("is_there", [True, False])
 def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_speaks_for_itself(is_there: bool) -> None:
     """A drive that adds an aisle like one of the map: the map has six metres of it, of which a fifth was restocked since, or all."""
     twin = aisle(1, y_m=30.0)
-    rng = np.random.default_rng(8)
-    shelf = np.unique(np.floor(twin.points_map * 2.0).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
-    changed = (rng.random(shelf.max() + 1) < (0.2 if is_there else 1.0))[shelf]
-    before = repainted(twin, aisle(77), changed)
-    both = together(HOME, before)
+    both = together(HOME, restocked(0.2 if is_there else 1.0, 8, 77, twin))
     known = relocalizer(both, np.concatenate([drive(56), drive(16, start_m=2.0, y_m=30.0)]))
     places = drive(40, start_m=2.0, y_m=30.0)
-    said, located = verdict(membership(known, twin, places, places[0]))
-    assert (said is MembershipVerdict.JOINED) == is_there
-    if is_there:
-        assert isinstance(located, SessionPlace)
+    test = membership(known, twin, places, places[0])
+    if not is_there:
+        assert verdict(test)[0] is not MembershipVerdict.JOINED
+    else:
+        located = joined(test)
         assert located.competitor_share > located.seen.share
         assert np.linalg.norm((located.map_from_body - places)[:12, :3, 3], axis=1).max() < 0.05

@@ -20,15 +20,9 @@ WALK = 0.01
 def circle() -> Array:
     """map_from_body (K, 4, 4): one lap of 80 m that ends where it began."""
     angle = 2 * np.pi * np.arange(COUNT) / (COUNT - 1)
-    return np.array(
-        [
-            se3(
-                so3_exp(np.array([0.0, 0.0, a + np.pi / 2])),
-                np.array([12.7 * np.cos(a), 12.7 * np.sin(a), 0.2 * np.sin(2 * a)]),
-            )
-            for a in angle
-        ]
-    )
+    places_m = np.column_stack([12.7 * np.cos(angle), 12.7 * np.sin(angle), 0.2 * np.sin(2 * angle)])
+    headings = (so3_exp(np.array([0.0, 0.0, a + np.pi / 2])) for a in angle)
+    return np.array([se3(heading, place_m) for heading, place_m in zip(headings, places_m, strict=True)])
 
 
 def drifted(truth: Array, drift: float, rng: np.random.Generator) -> tuple[Array, Array]:
