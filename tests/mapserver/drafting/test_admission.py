@@ -1,9 +1,9 @@
 """What a build makes of a recording's calibration before it surveys."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.calibration_scene import estimate
 
 P = CalibrationParameter
+Checked = Callable[..., admission.CheckedRecording]
 
 
 @pytest.fixture(scope="module")
@@ -34,29 +35,29 @@ def measured(parameter: P, value: float) -> MeasuredCalibration:
     return MeasuredCalibration(findings_of(found, 200.0), found)
 
 
-def checked(
-    recording: Recording,
-    monkeypatch: pytest.MonkeyPatch,
-    first: MeasuredCalibration,
-    again: MeasuredCalibration,
-    gyro: GyroFit | None = None,
-    metres: Mapping[str, tuple[float, float]] = MappingProxyType({}),
-) -> admission.CheckedRecording:
-    """With a doctor who measures `first`, and `again` after a correction."""
-    checks = CheckResults(list(first.findings), gyro, first, metres)
-    monkeypatch.setattr(admission, "run_checks", lambda *_, **__: checks)
-    monkeypatch.setattr(admission, "measure_calibration", lambda *_: again)
-    return admission.checked(recording)
+@pytest.fixture
+def checked(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> Checked:
+    """The recording, checked by a doctor who measures `first`, and `again` after a correction."""
+
+    def check(
+        first: MeasuredCalibration, again: MeasuredCalibration, gyro: GyroFit | None = None, **metres: Any
+    ) -> Any:
+        checks = CheckResults(list(first.findings), gyro, first, metres)
+        monkeypatch.setattr(admission, "run_checks", lambda *_, **__: checks)
+        monkeypatch.setattr(admission, "measure_calibration", lambda *_: again)
+        return admission.checked(recording)
+
+    return check
 
 
-def test_a_baseline_of_another_rig_is_refused(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_baseline_of_another_rig_is_refused(checked: Checked) -> None:
     off = measured(P.BASELINE, -0.0476)
     with pytest.raises(RecordingError, match=r"baseline: -4.76 % from the calibration.*a map of it would be wrong"):
-        checked(recording, monkeypatch, off, off)
+        checked(off, off)
 
 
-def test_a_small_error_is_corrected_and_said(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = checked(recording, monkeypatch, measured(P.FOCAL, -0.0196), measured(P.FOCAL, 0.0))
+def test_a_small_error_is_corrected_and_said(recording: Recording, checked: Checked) -> None:
+    found = checked(measured(P.FOCAL, -0.0196), measured(P.FOCAL, 0.0))
     given = recording.calibration.cameras[0].intrinsics_px[0]
     assert found.rig.cameras[0].intrinsics_px[0] == pytest.approx(0.9804 * given)
     assert found.corrections == {"focal length": -0.0196}
@@ -88,14 +89,9 @@ NOTHING, SAME, OTHER = MeasuredCalibration([], None), measured(P.TIME_OFFSET, -0
     ],
 )
 def test_a_time_offset_is_corrected_if_two_say_the_same(
-    recording: Recording,
-    monkeypatch: pytest.MonkeyPatch,
-    calibration: MeasuredCalibration,
-    gyro: GyroFit | None,
-    corrected_s: float | None,
-    says: str,
+    checked: Checked, calibration: MeasuredCalibration, gyro: GyroFit | None, corrected_s: float | None, says: str
 ) -> None:
-    found = checked(recording, monkeypatch, calibration, OTHER, gyro)
+    found = checked(calibration, OTHER, gyro)
     assert found.corrections.get("time offset") == corrected_s
     assert found.rig.cameras[0].imu_minus_cam_s == pytest.approx(corrected_s or 0.0)
     assert says in " ".join(found.remarks()) and ("not corrected" in " ".join(found.remarks())) == bool(found.held)
@@ -105,20 +101,18 @@ def test_a_time_offset_is_corrected_if_two_say_the_same(
 @pytest.mark.parametrize("metres", [None, 0.98, 1.0])
 @pytest.mark.parametrize(("name", "sigma"), [("the wheels", 0.001), ("the accelerometer", 0.08)])
 def test_a_correction_that_leaves_the_metres_of_another_sensor_is_not_made(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch, parameter: P, metres: float | None, name: str, sigma: float
+    recording: Recording, checked: Checked, parameter: P, metres: float | None, name: str, sigma: float
 ) -> None:
     known = {} if metres is None else {name: (metres, sigma)}
-    found = checked(recording, monkeypatch, measured(parameter, -0.02), measured(parameter, 0.0), metres=known)
+    found = checked(measured(parameter, -0.02), measured(parameter, 0.0), **known)
     is_denied = metres == 1.0 and sigma < 0.01  # a coarse one cannot tell
     assert (parameter.value in found.corrections, found.rig is recording.calibration) == (not is_denied, is_denied)
     assert ("metric scale" in found.calibration.doubted) == is_denied
     assert ("a metre of the images is 1.000 m by the wheels, not 0.980 m" in found.remarks()[-1]) == is_denied
 
 
-def test_a_correction_that_the_second_look_denies_is_for_a_person(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = checked(recording, monkeypatch, measured(P.PAIR_YAW, 0.003), measured(P.PAIR_YAW, 0.002))
+def test_a_correction_that_the_second_look_denies_is_for_a_person(checked: Checked) -> None:
+    found = checked(measured(P.PAIR_YAW, 0.003), measured(P.PAIR_YAW, 0.002))
     assert "after its correction" in found.calibration.doubted["pair geometry"]
 
 
@@ -149,9 +143,9 @@ def test_checks_that_lack_the_same_are_one_remark(recording: Recording) -> None:
     assert len(found.statements()) == 5  # a report has each
 
 
-def test_a_good_calibration_is_left_alone(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_good_calibration_is_left_alone(recording: Recording, checked: Checked) -> None:
     good = measured(P.BASELINE, 0.001)
-    found = checked(recording, monkeypatch, good, good)
+    found = checked(good, good)
     assert found.rig is recording.calibration
     assert (found.corrections, found.remarks(), found.calibration.doubted) == ({}, [], {})
     assert found.statements() == []

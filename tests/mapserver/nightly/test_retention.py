@@ -101,11 +101,12 @@ def test_a_recording_that_somebody_else_removes_meanwhile_ends_nothing(
     assert remove_old(inbox, 1.0, time.time_ns() + 2 * DAY_S * 10**9) == 2, "the file and the link"
 
 
-def test_the_command_takes_its_periods_from_the_file(run, inbox: Path, store: MapStore, tmp_path: Path) -> None:
-    save_picture_draft(store, 0.0, 3.0)
+def test_the_command_takes_its_periods_from_the_file(run, inbox: Path, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_picture_draft(store, 0.0, 3.0)
     config = tmp_path / "site.toml"
     config.write_text("[ingest]\nrecording_days = 1e-9\nsurvey_picture_days = 1e-9\n")
-    command = ["retention", "--store", store.folder, "--inbox", inbox.parent]
+    command = ["retention", "--store", tmp_path / "store", "--inbox", inbox.parent]
     assert "recordings of surveys: 0 removed\n" in run(*command)
     command += ["--config", config]
     assert "recordings of surveys: 5 would be removed\n" in run(*command, "--dry-run")

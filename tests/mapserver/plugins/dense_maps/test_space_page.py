@@ -33,6 +33,7 @@ from support.fleet.dashboard_scene import (
     serving,
     talking,
     wait_until,
+    watch,
 )
 from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import assert_whole
@@ -251,6 +252,7 @@ def test_a_plan_says_what_was_moved_between_two_versions(page: Page, tmp_path: P
         assert [each["properties"]["change"] for each in answered.value.json()["features"]] == ["appeared"]
         page.goto(address + str(bare))
         expect(page.get_by_text("No plan of what was moved")).to_contain_text("surfel_map = true")
+        watch(page).faults.clear()  # the picture is not there
 
 
 # The expected view on the page of a failure, and the links to the page in three dimensions.
@@ -349,7 +351,7 @@ def test_without_surfels_one_walks_among_landmarks_and_is_told(page: Page, walke
     assert page.evaluate(SEEN)["camera"][:2] == pytest.approx((30.0, 14.0), abs=0.6)
     expect(page.locator("main")).to_contain_text("Version 1 of site hall has no surfels")
     expect(page.locator(".expected")).to_be_hidden()
-    opened(page, walked, "space", version=1, x="here", y=14)
+    opened(page, walked, "space", version=1, x="here", y=14).refused(404)
     expect(page.locator(".notice.bad")).to_contain_text("are no place; write metres")
 
 

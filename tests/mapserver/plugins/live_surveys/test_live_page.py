@@ -111,7 +111,7 @@ class Drive:
         with pytest.MonkeyPatch.context() as patch, played(recording, frames, 0, SensorSet.STEREO) as drive:
             patch.setattr(live_survey, "MappingProcess", MappingHere)
             request = LiveRequest("lab", store / "maps", SETTINGS, options)
-            built = run_live(request, drive, self._hear, lambda: False, Console(quiet=True)).built
+            _, built = run_live(request, drive, self._hear, lambda: False, Console(quiet=True))
         (self.survey,) = (surveyed.survey for surveyed in built.built.surveyed)
         self.trajectory, self.mapping = built.trajectory, MappingHere.made
 

@@ -22,9 +22,10 @@ from mapserver.survey.state import KeyframeMotion, OdometryPass, RelativeTerm, S
 from support.worlds.corridor_scene import plain_marks
 
 PER_KEYFRAME = 40
+Ends, Span = list[tuple[int, int]], tuple[float, int]
 
 
-def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> SurveyState:
+def survey(seen: list[range], loops: Ends | None = None) -> SurveyState:
     """Keyframes at 1 Hz; every keyframe sees a range of landmarks, loops share 20 more."""
     pairs = [(k, n) for k, numbers in enumerate(seen) for n in numbers]
     count = max((n for _, n in pairs), default=-1) + 1
@@ -100,11 +101,7 @@ def test_an_unbroken_survey_stays_as_it_is() -> None:
     ids=["unbroken", "a blink", "a way into the dark", "many blind", "a long darkness", "a loop"],
 )  # fmt: skip
 def test_parts_are_joined_by_pictures_loops_and_sure_odometry(
-    seen: list[range],
-    grows_m: list[float],
-    loops: list[tuple[int, int]],
-    parts: list[tuple[float, int, bool]],
-    stray: list[tuple[float, int]],
+    seen: list[range], grows_m: list[float], loops: Ends, parts: list[tuple[float, int, bool]], stray: list[Span]
 ) -> None:
     found = find_components(survey(seen, loops), sigmas(grows_m), 0.1)
     assert [(p.end_s, p.keyframes, p.kept) for p in found.components] == parts
