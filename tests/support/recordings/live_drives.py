@@ -19,7 +19,6 @@ from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.plugins.live_surveys import live_survey
 from mapserver.plugins.live_surveys.drives import RecordedDrive
 from mapserver.plugins.live_surveys.live_map import LiveMap
-from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH
 from mapserver.plugins.live_surveys.message import MapSketch, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import BODY_FROM_CAM0, Sample, calibration
@@ -34,7 +33,7 @@ class MappingHere:
     made: "MappingHere"
 
     def __init__(self, rectifier: Rectifier) -> None:
-        self._rectifier, self.sketch = rectifier, NO_SKETCH
+        self._rectifier, self.sketch = rectifier, MapSketch(keyframes=0)
         self.behind, self.most_behind, self.failed, self.longest_lag_s = 0, 0, "", 0.0
         self.after: dict[int, MapSketch] = {}  # by frame
         MappingHere.made = self
