@@ -129,7 +129,7 @@ class World:
             outbox=outbox,
             replays=None,
             publisher=listener,
-            server=ServerSync(client, outbox, retry_s=600.0),
+            server=ServerSync(client, outbox, retry_s=600.0, put_prior=intake.put_prior),
             first=client.active(),
             caches=caches,
         )
