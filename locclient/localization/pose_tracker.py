@@ -172,9 +172,9 @@ class PoseTracker:
         known = self.confirmed or (None if self.prior is None else self.prior.hypothesis)
         if known is None:
             return start
-        of_pose = {name: getattr(known, name) for name in ("frame_index", "stamp_ns", "support", "has_broken")}
+        found = {name: getattr(known, name) for name in ("frame_index", "stamp_ns", "support", "has_broken")}
         how = {} if self.prior is None else {name: getattr(self.prior, name) for name in _OF_PRIOR}
-        return replace(start, **known.start._asdict(), **of_pose, **how, is_confirmed=self.confirmed is not None)
+        return replace(start, **known.start._asdict(), **found, **how, is_confirmed=self.confirmed is not None)
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""

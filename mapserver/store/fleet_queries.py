@@ -310,14 +310,19 @@ def _ids(change: Transaction, keys: Iterable[Key]) -> dict[Key, int]:
     its replica, may have lost keys that a cache would still know, and counts would go to another one."""
     wanted, found = list(dict.fromkeys(keys)), dict[Key, int]()
     for first in range(0, len(wanted), _KEYS_AT_ONCE):
-        values = [part for key in wanted[first : first + _KEYS_AT_ONCE] for part in key]
-        groups = ", ".join(["(?, ?, ?)"] * (len(values) // 3))
-        change.execute(f"INSERT INTO tally_keys (site, axis, key) VALUES {groups} ON CONFLICT DO NOTHING", values)
-        query = f"SELECT site, axis, key, id FROM tally_keys WHERE (site, axis, key) IN (VALUES {groups})"
-        found |= {
-            (site, axis, key): int(number) for site, axis, key, number in change.execute(query, values).fetchall()
-        }
+        some = wanted[first : first + _KEYS_AT_ONCE]
+        found |= _known_ids(change, some)
+        if new := [key for key in some if key not in found]:
+            change.insert("tally_keys", [dict(zip(("site", "axis", "key"), key, strict=True)) for key in new])
+            found |= _known_ids(change, new)
     return found
+
+
+def _known_ids(change: Transaction, keys: Sequence[Key]) -> dict[Key, int]:
+    groups = ", ".join(["(?, ?, ?)"] * len(keys))
+    query = f"SELECT site, axis, key, id FROM tally_keys WHERE (site, axis, key) IN (VALUES {groups})"
+    rows = change.execute(query, [part for key in keys for part in key]).fetchall()
+    return {(site, axis, key): int(number) for site, axis, key, number in rows}
 
 
 def _add_counters(change: Transaction, ids: Mapping[Key, int], counters: Mapping[CounterKey, Counters]) -> None:

@@ -60,7 +60,9 @@ def test_every_setting_is_read_somewhere() -> None:
     """A setting that nothing reads promises something that does not happen."""
     files = [path for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))]
     source = "\n".join(path.read_text("utf-8") for path in files)
-    core = "\n".join(path.read_text("utf-8") for path in (REPOSITORY / "shared/core").rglob("*.[ch]*"))
+    core = "\n".join(
+        path.read_text("utf-8") for path in (REPOSITORY / "shared/core").rglob("*") if path.suffix in {".cpp", ".h"}
+    )
     read = {*re.findall(r"\.(\w+)", source), *re.findall(r"[\"'](\w+)(?=[\"'])", source)}
     read |= {*re.findall(r'\["(\w+)"\]', core)}  # which takes a section as an object
     unread = [

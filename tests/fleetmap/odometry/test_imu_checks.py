@@ -141,7 +141,7 @@ def test_the_odometry_goes_on_without_what_is_wrong(wrong: str, frames: int, mon
         estimates.append(odometry.handle_stereo(stereo_frame(k * FRAME_NS)))
     assert ("wrong sign" in odometry.accelerometer.fault) == (wrong == "accelerometer")
     assert odometry.refuses_imu == (wrong == "clock")
-    assert odometry.imu_late_s == (0.1 if wrong == "clock" else None)
+    assert odometry.clock.off_s == (0.1 if wrong == "clock" else None)
     assert estimates[25].inertial or wrong == "accelerometer"
     assert not estimates[-1].inertial
     first, last = (analytic_motion(n * FRAME_NS * 1e-9).map_from_body for n in (frames - 9, frames))
