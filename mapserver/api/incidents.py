@@ -13,7 +13,7 @@ from mapserver.nightly.inbox import Inbox, contents, sites_of
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import FailureRow, MapStore
 
-_FAILURE = re.compile("failure/[^/]+/([0-9]{1,12})")
+_FAILURE = re.compile("failure/([^/]+)/([0-9]{1,12})")
 
 
 def of_failure(row: FailureRow) -> Incident:
@@ -21,7 +21,7 @@ def of_failure(row: FailureRow) -> Incident:
     words = (
         f"{row.robot} failed: {row.cause.replace('_', ' ') or 'cause unknown'}{f', {row.where}' if row.where else ''}"
     )
-    return Incident("failure", row.site, str(row.number), row.happened_ns, words)
+    return Incident("failure", row.site, str(row.number), row.received_ns, words)
 
 
 def of_drafts(store: MapStore, site: str) -> Iterator[Incident]:
@@ -59,11 +59,12 @@ def present(
     if inbox is not None:
         for name in (name for name in sites_of(inbox) if site in (None, name)):
             found += of_inbox(contents(inbox / name, SETTLE_S, now_ns))
-    names = (incident.split("/") for incident in store.incident_acts() if incident.startswith("failure/"))
-    failures = (Incident("failure", name[1], name[2], 0, "") for name in names if site in (None, name[1]))
-    for failure in with_acts(store, failures):
-        with suppress(UsageError):  # it was removed, or its time is over
-            found += [of_failure(store.fleet.failure(int(failure.about)).failure)] if failure.state != "closed" else []
+    for incident, acts in store.incident_acts().items():
+        named = _FAILURE.fullmatch(incident)
+        if named and site in (None, named[1]) and not acts[-1].detail.startswith("closed"):
+            with suppress(UsageError):  # it was removed, or its time is over
+                failure = of_failure(store.fleet.failure(int(named[2])).failure)
+                found += [failure] if acts[-1].stamp_ns >= failure.since_ns else []  # else of another one of this number
     return with_acts(store, found)
 
 
@@ -74,8 +75,8 @@ def incidents(*of: Any) -> list[Incident]:
 
 def find(incident: str, store: MapStore, *more: Any) -> Incident:
     """Return one of those that are present or any failure, by its id; UsageError for another one."""
-    number = _FAILURE.fullmatch(incident)
-    found = [of_failure(store.fleet.failure(int(number[1])).failure)] if number else present(store, *more)
+    named = _FAILURE.fullmatch(incident)
+    found = [of_failure(store.fleet.failure(int(named[2])).failure)] if named else present(store, *more)
     for one in found:
         if one.id == incident:
             return one

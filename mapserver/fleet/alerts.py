@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 
 from fleetmap.config import Positive, Section
 from fleetmap.errors import StateError
@@ -19,7 +20,7 @@ HEARD_WITHIN_S = 60.0
 _LEAST_FREE_SHARE, _LEAST_FREE_BYTES = 0.1, 50_000_000_000
 _RATE_HOURS = 24
 _TOLD_NS = 24 * HOUR_NS  # duration of the alert for a rolled back version
-_LOST = {Status.LOST, Status.AMBIGUOUS, Status.INITIALISING}
+_LOST = {Status.LOST: "it is lost", Status.AMBIGUOUS: "several places fit", Status.INITIALISING: "it is starting"}
 _STATES = {"acknowledged": "acknowledged", "handed": "acknowledged", "closed": "closed"}  # reopened and ended: open
 
 
@@ -28,8 +29,8 @@ class Incident:
     """Something present. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapRobotOverloaded, FleetmapNightFailed,
     FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault of an alert, else failure, recording or draft.
 
-    about: its robot, job, version, failure or file, empty for a site as a whole; since_ns: start, nanoseconds since 1970, now if it is
-    unknown. state: open, acknowledged or closed; assignee: who has it, empty for nobody; acts: what people did, oldest first.
+    about: its robot, job, version, failure or file, empty for a site as a whole; since_ns: start, of a failure when its report came,
+    nanoseconds since 1970, now if it is unknown. state: open, acknowledged or closed; assignee: who has it, empty for nobody; acts: what people did, oldest first.
     """
 
     name: str
@@ -122,7 +123,7 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
         health = robot.last_health or {}
         since_ns = lost_since_ns(robot, settings, now_ns)
         if since_ns is not None:
-            words = f"has had no known position for {(now_ns - since_ns) / 60e9:.0f} min ({health.get('status')})"
+            words = f"has had no known position for {(now_ns - since_ns) / 60e9:.0f} min: {_LOST[health['status']]}"
             yield Incident("FleetmapRobotLost", site, robot.robot, since_ns, f"{robot.robot} of {site} {words}")
         if Flag.OVERLOADED in health.get("flags", ()) and robot.seconds_since <= HEARD_WITHIN_S:
             words = f"{robot.robot} of {site} is too slow: {dropped_words(health.get('metrics', {}))}"
@@ -134,7 +135,8 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
     night = store.last_night(site)
     if night is not None and night.state == "failed":
         words = f"the night of {site} failed (job {night.id}): {night.message}"
-        yield Incident("FleetmapNightFailed", site, f"job {night.id}", now_ns, words)
+        ended = datetime.fromisoformat(night.finished or night.started)
+        yield Incident("FleetmapNightFailed", site, f"job {night.id}", int(ended.timestamp()) * 10**9, words)
     for row in store.canaries(site):
         if row.state == "rolled_back" and row.ended_ns is not None and now_ns - row.ended_ns < _TOLD_NS:
             words = f"version {row.version} of {site} was rolled back: {row.outcome}"

@@ -78,7 +78,7 @@ def trust_status(store: MapStore) -> TrustStatus:
             continue
         if lists.newest(role) and not lists.is_signed(known[role]):
             found.faults.append(
-                f"{role}: its list is not signed by its present key; look for {own.path(role)}, or name another: "
+                f"list of {role}: it is not signed by its present key; look for {own.path(role)}, or name another: "
                 f"`mapserver trust admit {info.site}`"
             )
         if own.has(role):

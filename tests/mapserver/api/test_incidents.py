@@ -1,6 +1,7 @@
 """Incidents: what somebody must look after is acknowledged, handed over, commented, closed and reopened by route, command and webhook."""
 
 import json
+import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -101,6 +102,14 @@ def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
         assert "\x1b" not in run(app, "incidents", "list", "--store", folder, "--inbox", tmp_path / "inbox")
         done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines()][-7:-2]
         assert done == ["acknowledged", "handed to Bob B", "commented", "closed", "reopened"]
+        act(server, "acknowledge", FAILURE)
+        server.store.fleet.remove_failure(1)
+        old = blindness("f2", wall_ns=time.time_ns() - 3_600_000_000_000)  # kept by its robot for an hour
+        assert not server.fleet.take_failure("lab", "r1", old).refused
+        assert server.store.fleet.failure(1).report.id == "f2", "its number is given again"
+        assert FAILURE not in states(server)
+        act(server, "acknowledge", FAILURE)
+        assert states(server)[FAILURE] == ("acknowledged", "dan"), "what was done about the other one is over"
         for name, told, status in (
             ("comment", {"incident": DRAFT}, 422),
             ("close", {"incident": "failure/lab/9"}, 404),

@@ -52,13 +52,17 @@ def test_what_holds_is_named_and_nothing_else(store: MapStore, clock: Clock) -> 
         fleet.take_health("lab", "r1", health("LOST" if number % 2 else "AMBIGUOUS", 4000 + 30 * number))
         clock.now_ns += 30 * 10**9
         assert (names() == []) == (number < 9)
-    assert names() == [("FleetmapRobotLost", "r1")]
+    (alert,) = active_alerts(store, fleet, settings, clock())
+    assert (alert.name, alert.about) == ("FleetmapRobotLost", "r1")
+    assert alert.words == "r1 of lab has had no known position for 5 min: it is lost"
     clock.now_ns += 61 * 10**9
     assert names() == [], "a robot that is off is not lost"
     store.update_job(store.begin_job("lab", "nightly"), "failed", "the disk is full", {})
     assert names() == [("FleetmapNightFailed", "job 1")]
     store.begin_job("lab", "nightly")
-    assert names() == [("FleetmapNightFailed", "job 1")], "until another has ended"
+    failed_ns, clock.now_ns = clock(), clock.now_ns + HOUR_NS
+    (alert,) = active_alerts(store, fleet, settings, clock())
+    assert (alert.name, alert.about, alert.since_ns) == ("FleetmapNightFailed", "job 1", failed_ns), "until one ended"
     store.update_job(2, "done", "nothing to do", {})
     assert names() == []
     releases.start_canary(store, "lab", 1, 0.5)

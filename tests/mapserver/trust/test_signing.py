@@ -13,6 +13,7 @@ from fleetmap.errors import StateError, StoreError, UntrustedError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
 from mapserver import releases
 from mapserver.api.metrics import Metrics
+from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, signing, update_lists
@@ -116,7 +117,7 @@ def test_two_servers_do_not_make_the_keys_of_a_store_at_once(
     assert made == ["root", "online"]
 
 
-def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock) -> None:
+def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     lists = SignedLists(store.folder)
 
     def numbers() -> tuple[int, int, int]:
@@ -142,6 +143,11 @@ def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock) ->
     clock.now_ns += 700 * 24 * HOUR_NS
     update_lists(store)
     assert [words.partition(":")[0] for words in trust_status(store).faults] == ["root", "targets"]
+    clock.now_ns += 700 * 24 * HOUR_NS
+    monkeypatch.setattr(SignedLists, "is_signed", lambda *_: False)
+    ids = [alert.id for alert in active_alerts(store, Fleet(store), AlertSettings(), clock())]
+    assert {"FleetmapTrustFault/site-lab", "FleetmapTrustFault/list of site-lab"} < set(ids)
+    assert len(set(ids)) == len(ids), "each is acknowledged by itself"
 
 
 def test_old_lists_are_removed_and_roots_are_not(store: MapStore) -> None:
