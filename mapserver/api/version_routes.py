@@ -15,7 +15,7 @@ from mapserver import releases
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import bytes_response, is_held
-from mapserver.releases import Difference
+from mapserver.releases.version_diff import Difference
 from mapserver.store import Event, MapStore, SiteInfo
 
 _DIGESTS_KEPT = 256

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from fleetmap.mapformat.manifest import Manifest
-    from mapserver.releases import Difference
+    from mapserver.releases.version_diff import Difference
     from mapserver.store import Event, MapStore, VerdictRow, VersionInfo
 
 

@@ -23,7 +23,7 @@ from mapserver.floor_plan.alignment import PLAN, Alignment
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.nightly.inbox import Inbox, contents, sites_of
 from mapserver.quality.gate import GateSettings
-from mapserver.releases import Difference
+from mapserver.releases.version_diff import Difference
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import MapStore, VerdictRow, VersionInfo
 

@@ -20,7 +20,7 @@ from mapserver.floor_plan.survey_requests import courses
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
 from mapserver.quality.gate import CHECKS
-from mapserver.releases import Difference
+from mapserver.releases.version_diff import Difference
 from mapserver.store import Event, VerdictRow, VersionInfo
 from mapserver.store.rows import SiteReleases
 

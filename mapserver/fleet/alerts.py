@@ -30,7 +30,8 @@ class Incident:
     FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault of an alert, else failure, recording or draft.
 
     about: its robot, job, version, failure or file, empty for a site as a whole; since_ns: start, of a failure when its report came,
-    nanoseconds since 1970, now if it is unknown. state: open, acknowledged or closed; assignee: who has it, empty for nobody; acts: what people did, oldest first.
+    nanoseconds since 1970, now if it is unknown. state: open, acknowledged or closed; assignee: who has it, empty for nobody; acts: what
+    people did, oldest first.
     """
 
     name: str

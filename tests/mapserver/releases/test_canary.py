@@ -15,7 +15,6 @@ from mapserver import releases
 from mapserver.fleet.canary_controller import find, review
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
-from mapserver.releases import release
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, DraftContent, MapStore, Retention
 from support.fleet.made_fleet import NS, Known, MadeRobot, Message, drive, hear
@@ -196,16 +195,16 @@ def store(store: MapStore) -> MapStore:
 @pytest.fixture
 def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
     """Something that happens once between the judgement of a draft and its release."""
-    real = release._pass_gate
+    real = releases._pass_gate
 
     def between(action: Callable[[], object]) -> None:
         def judged(*given: object, **more: object) -> object:
-            monkeypatch.setattr(release, "_pass_gate", real)
+            monkeypatch.setattr(releases, "_pass_gate", real)
             found = real(*given, **more)
             action()
             return found
 
-        monkeypatch.setattr(release, "_pass_gate", judged)
+        monkeypatch.setattr(releases, "_pass_gate", judged)
 
     return between
 
