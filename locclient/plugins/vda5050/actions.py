@@ -25,11 +25,11 @@ _MOST_SIGNS = 2000
 
 
 class RefusedActionError(LinkError):
-    """An instant action that fails at once, with the type of its error."""
+    """An instant action that fails, with type and level of its error."""
 
-    def __init__(self, error_type: str, words: str) -> None:
+    def __init__(self, error_type: str, words: str, level: str = "WARNING") -> None:
         super().__init__(words)
-        self.error_type = error_type
+        self.error_type, self.level = error_type, level
 
 
 def parameters(action: Action, robot_actions: Sequence[str] = ()) -> dict[str, Any]:
@@ -87,12 +87,13 @@ class ActionBook:
         """Forget actions whose end was reported."""
         self._states = {key: state for key, state in self._states.items() if key not in self._told}
 
-    def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
+    def fail(self, action: Action, fault: Exception) -> None:
         """Mark the action as failed, with an error until another action of its kind is accepted."""
-        self.set(action, "FAILED", words)
+        told = fault if isinstance(fault, RefusedActionError) else RefusedActionError("MAP_ACTION_FAILED", str(fault))
+        self.set(action, "FAILED", str(told))
         given = {each.key: str(each.value)[:_MOST_SIGNS] for each in action.action_parameters[:20]}
-        shown = {"actionId": action.action_id} | given
-        self.add_error("map" if action.action_type in MAP_ACTIONS else "instant", error_type, words, shown, level)
+        until, shown = "map" if action.action_type in MAP_ACTIONS else "instant", {"actionId": action.action_id} | given
+        self.add_error(until, told.error_type, str(told), shown, told.level)
 
     def accepted(self, action: Action) -> None:
         """End errors that last until an action of this kind is accepted."""

@@ -18,7 +18,7 @@ from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.hooks import LinkedRobot
 from locclient.plugins.vda5050.actions import MAP_ACTIONS, ActionBook, RefusedActionError, parameters
-from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
+from locclient.plugins.vda5050.fleet_maps import FleetMaps
 from locclient.plugins.vda5050.localization import Localization, Position
 from locclient.plugins.vda5050.messages import Action, Error, InstantActions, Order, RobotPart, decode
 from locclient.plugins.vda5050.settings import Vda5050Section
@@ -29,10 +29,6 @@ _MOST_JOBS = 16
 _ENABLE_S = 120.0  # for the trial of a version, and that of the previous one after a failure
 _TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of flat ground, as x, y and theta define neither
 _SIGMAS = 3.7  # maximum distance from the fleet manager's pose for agreement
-_ERRORS: dict[type[Exception], tuple[str, str]] = {
-    DuplicateMapError: ("DUPLICATE_MAP", "WARNING"),
-    NoRoomError: ("INSUFFICIENT_MEMORY", "URGENT"),
-}
 _UNKNOWN: dict[str, Any] = {
     "operatingMode": "STARTUP",
     "powerSupply": {"stateOfCharge": 0.0, "charging": False},
@@ -146,7 +142,7 @@ class FleetAdapter:
                 self.factsheet_wanted.set()
             self._book.set(action, "FINISHED")
         except RefusedActionError as error:
-            self._book.fail(action, error.error_type, str(error))
+            self._book.fail(action, error)
         return None
 
     # --- maps ---------------------------------------------------------------------------------------------------------
@@ -174,7 +170,7 @@ class FleetAdapter:
             if enabling is not None and self._clock_s() > enabling[2]:
                 self._enabling = None
                 words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; check its cameras"
-                self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
+                self._book.fail(enabling[0], LinkError(words))
                 self.changed.set()
             if maps is None or not self._jobs or (self._enabling and self._jobs[0][0].action_type == "enableMap"):
                 return
@@ -184,9 +180,8 @@ class FleetAdapter:
         try:
             self._act(maps, action, given)
         except Exception as error:
-            kind, level = _ERRORS.get(type(error), ("MAP_ACTION_FAILED", "WARNING"))
             with self._lock:
-                self._book.fail(action, kind, str(error), level)
+                self._book.fail(action, error)
             if not isinstance(error, FleetmapError):
                 raise  # to the log of the thread
         with self._lock:
@@ -224,7 +219,7 @@ class FleetAdapter:
             if change.change is Change.ADOPTED:
                 self._book.set(enabling[0], "FINISHED")
             else:
-                self._book.fail(enabling[0], "MAP_ACTION_FAILED", f"the robot did not adopt it: {change.reason}")
+                self._book.fail(enabling[0], LinkError(f"the robot did not adopt it: {change.reason}"))
             self.changed.set()
 
     # --- position -----------------------------------------------------------------------------------------------------
@@ -307,7 +302,7 @@ class FleetAdapter:
             words = f"the robot is localized {off_m:.2f} m and {off_rad:.2f} rad from there"
         if is_last or self._clock_s() > until_s:
             self._placing = None
-            self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
+            self._book.fail(action, RefusedActionError("INITIALIZE_POSITION_FAILED", words))
             self.changed.set()
         return None
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO
 from urllib.parse import SplitResult, urlsplit
@@ -22,6 +23,7 @@ from fleetmap.messages import WantedVersion
 from locclient.hooks import LinkedRobot
 from locclient.maps.map_source import addresses_of
 from locclient.maps.tile_cache import ActiveVersion
+from locclient.plugins.vda5050.actions import RefusedActionError
 
 _TOGETHER = 2  # space for a file, and for its extracted blobs
 _CHUNK_BYTES = 1 << 18
@@ -29,15 +31,8 @@ _STALL_S = 30.0  # without a byte
 _MIN_BYTES_PER_S = 20_000  # mean of a file, after _STALL_S: no server may occupy the network thread for a day
 _REMEDY = "; delete a map, or raise [run] cache_bytes"
 _HALF = f": half of the room in the cache{_REMEDY}"
+_no_room = partial(RefusedActionError, "INSUFFICIENT_MEMORY", level="URGENT")
 _log = logging.getLogger(__name__)
-
-
-class NoRoomError(StoreError):
-    """A file that is larger than half of the room in the cache, or a version that does not fit."""
-
-
-class DuplicateMapError(StateError):
-    """A version that the robot already has."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,8 @@ class Origins:
 def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) -> str:
     """Download a link into `target` and return the SHA-256. Redirections are not followed.
 
-    Raises LinkError for a refused link or a response that is an error, NoRoomError for one longer than max_bytes, UnreachableError if the
-    server does not answer or stalls, StoreError on a disk error.
+    Raises LinkError for a refused link or a response that is an error, RefusedActionError for one longer than max_bytes, UnreachableError
+    if the server does not answer or stalls, StoreError on a disk error.
     """
     parts = origins.admit(link)
     connection = _connection(parts, origins)
@@ -109,11 +104,11 @@ def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) 
 def _receive(answer: http.client.HTTPResponse, link: str, target: IO[bytes], max_bytes: int) -> str:
     whole, received, begun_s = hashlib.sha256(), 0, time.monotonic()
     if answer.length is not None and answer.length > max_bytes:
-        raise NoRoomError(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}{_HALF}")
+        raise _no_room(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}{_HALF}")
     while chunk := answer.read1(_CHUNK_BYTES):
         received += len(chunk)
         if received > max_bytes:
-            raise NoRoomError(f"{link[:200]} has more than {max_bytes} bytes{_HALF}")
+            raise _no_room(f"{link[:200]} has more than {max_bytes} bytes{_HALF}")
         late_s = time.monotonic() - begun_s - _STALL_S
         if late_s > 0 and received < late_s * _MIN_BYTES_PER_S:
             raise UnreachableError(f"{link[:200]} comes too slowly: {received} bytes in {late_s + _STALL_S:.0f} s")
@@ -173,10 +168,11 @@ class FleetMaps:
 
         sha256: of the file, None or empty if unknown.
 
-        Raises DuplicateMapError, NoRoomError, LinkError, UntrustedError, MapFormatError, StoreError.
+        Raises RefusedActionError, LinkError, UntrustedError, MapFormatError, StoreError.
         """
         if version in dict(self.versions()):
-            raise DuplicateMapError(f"version {version} is on the robot already; delete it before another download")
+            words = f"version {version} is on the robot already; delete it before another download"
+            raise RefusedActionError("DUPLICATE_MAP", words)
         if self._needs_hash and not sha256:
             raise LinkError("without a map server no signed list admits a file; send its SHA-256 as mapHash")
         room_bytes = self._cache.room_bytes() // _TOGETHER
@@ -202,7 +198,7 @@ class FleetMaps:
         reader.check_tiles(manifest)
         new = [blob for blob in head.blobs if blob.kind != "archive" and blob.sha256 not in self._cache]
         if sum(blob.bytes for blob in new) > self._cache.room_bytes():
-            raise NoRoomError(f"version {version} does not fit into the cache{_REMEDY}")
+            raise _no_room(f"version {version} does not fit into the cache{_REMEDY}")
         for number, blob in enumerate(head.blobs):
             if blob in new:
                 self._cache.put(blob.sha256, reader.data(number))

@@ -15,7 +15,8 @@ from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StateError
 from fleetmap.messages import WantedVersion
 from locclient.maps.tile_cache import TileCache
 from locclient.plugins.vda5050 import fleet_maps
-from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError, Origins
+from locclient.plugins.vda5050.actions import RefusedActionError
+from locclient.plugins.vda5050.fleet_maps import FleetMaps, Origins
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples
 
@@ -89,7 +90,7 @@ def test_a_version_is_taken_kept_and_deleted(tmp_path: Path, file: bytes) -> Non
         robot.maps.download(1, f"{http}/file", hashlib.sha256(file).hexdigest().upper())
         assert robot.maps.versions() == [(1, False)]
         assert [wanted.version for wanted in robot.asked] == [1]
-        robot.refuses(DuplicateMapError, "on the robot already", f"{http}/file")
+        robot.refuses(RefusedActionError, "on the robot already", f"{http}/file")
     again = Robot(tmp_path, http)
     assert again.maps.versions() == [(1, False)], "it survives a restart"
     wanted = again.maps.wanted(1)
@@ -124,12 +125,9 @@ def test_files_that_are_not_the_map_leave_nothing(tmp_path: Path, file: bytes) -
         robot.fault = UntrustedError("signature", "not in the signed list")
         robot.refuses(UntrustedError, "not in the signed list", f"{http}/file")
         robot.fault = None
-        assert Robot(tmp_path / "b", http, max_bytes=2 * len(file) + 2).maps.download(1, f"{http}/file", None) is None
-
-
-def test_a_map_that_does_not_fit_is_not_begun(tmp_path: Path, file: bytes) -> None:
-    with web_server(serve(file)) as http:
-        Robot(tmp_path, http, max_bytes=len(file)).refuses(NoRoomError, "the limit is|more than", f"{http}/file")
+        roomy = Robot(tmp_path / "b", http, max_bytes=2 * len(file) + 2)
+        roomy.maps.download(1, f"{http}/file", None)
+        assert roomy.maps.versions() == [(1, False)]
 
 
 def test_links_lead_to_named_servers_alone(tmp_path: Path, file: bytes) -> None:
@@ -166,7 +164,9 @@ def test_links_lead_to_named_servers_alone(tmp_path: Path, file: bytes) -> None:
             Origins((origin,)).check()
 
 
-def test_bodies_and_heads_without_end_and_servers_that_hang_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_and_heads_without_end_and_servers_that_hang_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: bytes
+) -> None:
     def endless(request: BaseHTTPRequestHandler) -> None:
         request.send_response(200)
         request.end_headers()
@@ -185,7 +185,10 @@ def test_bodies_and_heads_without_end_and_servers_that_hang_up(tmp_path: Path, m
         patch.setattr(fleet_maps, "_STALL_S", 0.3)
         Robot(tmp_path, http).refuses(LinkError, "cannot be fetched", f"{http}/file")
     with web_server(endless) as http:
-        Robot(tmp_path, http, max_bytes=1_000_000).refuses(NoRoomError, "more than 500000", f"{http}/file")
+        Robot(tmp_path, http, max_bytes=1_000_000).refuses(RefusedActionError, "more than 500000", f"{http}/file")
+    with web_server(serve(file)) as http:
+        words = f"{len(file)} bytes, the limit is {len(file) // 2}"
+        Robot(tmp_path, http, max_bytes=len(file)).refuses(RefusedActionError, words, f"{http}/file")
     with web_server(serve(b"short", **{"Content-Length": "5000"})) as http:
         Robot(tmp_path, http).refuses(LinkError, "fetched|early", f"{http}/file")
     with web_server(serve(b"", 404)) as http:
