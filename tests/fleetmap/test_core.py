@@ -81,12 +81,13 @@ def tracker(**changed: float) -> core.Tracker:
     return core.Tracker(np.array([9.0, 15.0, 10.0, 9.0]), settings, StereoSettings(), 8.0, REFINEMENT)
 
 
-def tracked(pixels: Array) -> tuple[object, float]:
+def tracked(image: Array, pixels: Array) -> tuple[object, float]:
     """Points followed from anywhere to anywhere."""
     held = tracker()
-    held.begin(NOISE)
+    held.begin(image)
     held.add(pixels)
-    return held.track(NOISE[::-1].copy(), (NOISE, NOISE, NOISE), None, np.eye(4), True, pixels)
+    found, share = held.track(image[::-1].copy(), (image, image, image), None, np.eye(4), True, pixels)
+    return {name: getattr(found, name) for name in dir(found) if not name.startswith("_")}, share
 
 
 def test_the_stub_names_everything() -> None:
@@ -149,21 +150,24 @@ def test_what_cannot_be_is_refused(call: object, told: str) -> None:
 @pytest.mark.parametrize("lens", [np.ones(8), np.ones(4)])
 def test_a_depth_image_of_strange_numbers_gives_values(strange: float, lens: Array) -> None:
     points = np.full((4, 3), strange)
-    core.register_depth(
+    registered = core.register_depth(
         DEPTH * np.float32(strange), points, np.eye(4), np.full(4, strange), lens * strange, strange, 9, 9
     )
+    assert not registered.any(), "no depth that a planner would take for one"
 
 
-# Calls with places (4, 2) of any numbers, at which they read a noisy image; test_core_hostile.py seldom finds images that go together.
+# Calls with places (4, 2) of any numbers, at which they read a noisy image.
 HOSTILE = {
-    "match_rows": lambda places: core.match_rows(*[NOISE] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0),
-    "match_rows, without a limit": lambda places: core.match_rows(
-        *[NOISE] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0
+    "match_rows": lambda image, places: core.match_rows(
+        *[image] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0
     ),
-    "follow_pixels": lambda places: core.follow_pixels(
-        NOISE, NOISE[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
+    "match_rows, without a limit": lambda image, places: core.match_rows(
+        *[image] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0
     ),
-    "tracker": lambda places: tracked(np.column_stack([places, places[::-1, 0]])),
+    "follow_pixels": lambda image, places: core.follow_pixels(
+        image, image[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
+    ),
+    "tracker": lambda image, places: tracked(image, np.column_stack([places, places[::-1, 0]])),
 }
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
 ANY_MATCH = StereoSettings(
@@ -176,7 +180,13 @@ ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18
 @given(places=arrays(np.float64, (4, 2), elements=ANY))
 @settings(max_examples=200, deadline=None)
 def test_no_number_leads_out_of_an_image(name: str, places: Array) -> None:
-    HOSTILE[name](places)
+    """What lies before and behind it in memory changes no result."""
+    results = []
+    for around in (0, 255):
+        memory = np.full((60, 30), around, np.uint8)
+        memory[20:40] = NOISE
+        results.append(HOSTILE[name](memory[20:40], places))
+    np.testing.assert_equal(*results)
 
 
 def test_products_are_rounded_before_they_are_added() -> None:

@@ -285,10 +285,10 @@ def test_robots_accept_lists_older_than_a_site_or_a_key_that_they_know(
         publish_samples(store, 1, first=3, site="other")
     if change != "a site":
         rotate_online(store, KeyFolder(store.folder / "keys").signer("root"))
-    follow(tmp_path / "robot", root, store)
+    known = follow(tmp_path / "robot", root, store).read("timestamp").version
     restore(target, tmp_path / "new", ADA, identities=[identity])
     with MapStore.open(tmp_path / "new") as restored:
-        follow(tmp_path / "robot", root, restored)
+        assert follow(tmp_path / "robot", root, restored).read("timestamp").version > known
 
 
 def follow(robot: Path, root: bytes, store: MapStore) -> SignedLists:
