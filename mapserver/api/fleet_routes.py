@@ -3,43 +3,32 @@
 import time
 from dataclasses import replace
 from itertools import accumulate
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request, Response
 
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.mapformat.names import sha256_hex
-from fleetmap.messages import InitialPoseMessage
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
-from mapserver.api.guard import Sender
-from mapserver.fleet.building import ask_for_survey, end_request
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_decision import route_geojson
-from mapserver.floor_plan.survey_requests import SurveyRequest
-from mapserver.serving.bus_service import place_robot
 from mapserver.store import FailureRow
 
 _MAX_PAGE_BYTES = 4_000_000
 
 
-class Span(NamedTuple):
-    """Hours since 1970, the end excluded."""
-
-    first: int
-    end: int
-
-
-def _span(within: p.TimeRange, hours: p.Hours = 24) -> Span:
+def _span(within: p.TimeRange, hours: p.Hours = 24) -> tuple[int, int]:
+    """Return the first hour since 1970, and that behind the last."""
     since_ns, until_ns = within
     end = hour_of(time.time_ns()) + 1 if until_ns is None else hour_of(until_ns - 1) + 1
-    return Span(end - hours if since_ns is None else hour_of(since_ns), end)
+    return end - hours if since_ns is None else hour_of(since_ns), end
 
 
-Asked = Annotated[Span, Depends(_span)]
+Asked = Annotated[tuple[int, int], Depends(_span)]
 router = APIRouter()
 
 
@@ -55,17 +44,6 @@ def robots(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> v
     return replace(page, limit=min(page.limit, fitting)).of(robots, name)
 
 
-@router.post("/v1/sites/{site}/robots/{robot}/initial_pose")
-def set_initial_pose(
-    service: p.Service, sender: Sender, site: p.Site, robot: p.Robot, act: views.PlaceAct
-) -> views.ServiceState:
-    """Send an operator's pose to a robot: it overrides the tracked pose until fixes outweigh it. `ok`: the robot was notified."""
-    place = act.model_dump(exclude={"actor", "reason"})
-    told = InitialPoseMessage(site=site, robot=robot, **place)
-    place_robot(service.store, service.fleet, service.bus, told, sender.of(act))
-    return views.OK
-
-
 @router.get("/v1/fleet/measures")
 def fleet_measures(
     store: p.Store, span: Asked, page: p.NamePage, by: p.Axis = "site", site: p.SiteFilter = None
@@ -74,7 +52,7 @@ def fleet_measures(
 
     Whole hours are counted, including those that contain `since` and `until`.
     """
-    found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
+    found = store.fleet.counters(site, by, since_hour=span[0], until_hour=span[1])
     shown, following = page.cut(found.items(), lambda item: "/".join(item[0]))
     measures = [views.KpisView(site=site, key=key, measures=kpis(counts)) for (site, key), counts in shown]
     return views.Page(items=measures, next=following)
@@ -86,8 +64,8 @@ def fleet_hours(
 ) -> views.Page[views.HourView]:
     """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
     store.current(site)  # raises for an unknown site
-    first = max(span.first, -1 if page.cursor is None else page.cursor + 1)
-    found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
+    first = max(span[0], -1 if page.cursor is None else page.cursor + 1)
+    found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span[1])
     shown, following = page.cut(found.items(), lambda item: item[0])
     hours = [views.HourView(hour_ns=hour * HOUR_NS, measures=kpis(counts)) for hour, counts in shown]
     return views.Page(items=hours, next=following)
@@ -127,21 +105,6 @@ def failure_recording(request: Request, store: p.Store, number: p.Number) -> Res
 def resurvey(service: p.Service, site: p.Site) -> ResurveyList:
     """Tiles to resurvey, the most urgent first, each with its reasons, and a route through them."""
     return resurvey_list(service.store, site, service.settings.config.resurvey, time.time_ns())
-
-
-@router.post("/v1/sites/{site}/resurvey/requests")
-def request_survey(store: p.Store, sender: Sender, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
-    """Request a survey of a polygon; its tiles stay on the list until the request is closed."""
-    return ask_for_survey(store, site, act.corners_map_m, sender.of(act))
-
-
-@router.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
-def end_survey_request(
-    store: p.Store, sender: Sender, site: p.Site, asked: p.RequestId, act: views.Act
-) -> views.ServiceState:
-    """Remove a request from the list because it was surveyed or is no longer wanted."""
-    end_request(store, site, asked, sender.of(act))
-    return views.OK
 
 
 @router.get("/v1/sites/{site}/resurvey/route")

@@ -13,7 +13,7 @@ from mapserver.api.guard import Sender
 from mapserver.api.operations import OPERATIONS, Caller, Operation
 
 _PARTS: dict[str, Any] = {"site": p.Site, "version": p.Version, "robot": p.Robot}
-_PARTS |= {"operator": p.Operator, "token": p.TokenNumber}
+_PARTS |= {"operator": p.Operator, "token": p.TokenNumber, "asked": p.RequestId}
 
 
 def router_of_operations() -> APIRouter:

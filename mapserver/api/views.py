@@ -6,13 +6,11 @@ from typing import Annotated, Any, Generic, Self, TypeVar
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from fleetmap.encoding import MOST
-from mapserver.fleet.building import MOST_CORNERS
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet_statistics.canary_decision import CanaryFinding, number_of
 from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.quality.figures import TrustedCalibration
-from mapserver.serving.bus_service import MOST_SIGMA_M
 from mapserver.store import (
     CanaryRow,
     FailureRow,
@@ -141,36 +139,12 @@ class Secret(BaseModel):
     secret: str
 
 
-Decimal = Annotated[float, Field(ge=-MOST, le=MOST)]
-
-
-def _body(**example: JsonValue) -> ConfigDict:
-    return ConfigDict(extra="forbid", json_schema_extra={"examples": [example]})
-
-
 class Act(BaseModel):
     """Reason and author of a change; with a session or token, the author is its name."""
 
     model_config = ConfigDict(extra="forbid")
     actor: Annotated[str | None, Field(min_length=1, max_length=200, examples=["ada"])] = None
     reason: Annotated[str, Field(max_length=2000, examples=["robots lose themselves in aisle 3"])] = ""
-
-
-class PlaceAct(Act):
-    """An operator's pose for a robot: metres in `map`, heading from x towards y, and its uncertainty (one sigma)."""
-
-    model_config = _body(actor="ada", x_map_m=12.5, y_map_m=3.0, heading_rad=1.57, sigma_m=0.5)
-    x_map_m: Decimal
-    y_map_m: Decimal
-    heading_rad: Decimal | None = None
-    sigma_m: Annotated[float, Field(gt=0, le=MOST_SIGMA_M)] = 0.5
-
-
-class SurveyAct(Act):
-    """Author and reason of a survey request; corners of its polygon in metres of `map`, the first not repeated at the end."""
-
-    model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
-    corners_map_m: Annotated[list[tuple[Decimal, Decimal]], Field(min_length=3, max_length=MOST_CORNERS)]
 
 
 _NOT_FOUND: dict[str, JsonValue] = {
@@ -212,6 +186,7 @@ class ServiceState(BaseModel):
 
 OK = ServiceState(status="ok")
 GeoJson = dict[str, Any]
+Survey = SurveyRequest
 
 
 class Page(BaseModel, Generic[T]):

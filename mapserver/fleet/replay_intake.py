@@ -13,7 +13,7 @@ import msgspec
 
 from fleetmap.errors import FleetmapError, LinkError, RecordingError
 from fleetmap.failure_summary import MAX_FILE_BYTES, ReplayPart
-from fleetmap.messages import FailureAck, decode_message
+from fleetmap.messages import FailureAck
 from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.store import FailureReplay, MapStore
@@ -46,12 +46,11 @@ class ReplayIntake:
         self._uploads: dict[tuple[str, str], _Upload] = {}
         self._rates = RateLimit(REPLAY_BURST, REPLAYS_PER_S, clock_ns)
 
-    def take(self, site: str, robot: str, payload: bytes) -> FailureAck:
+    def take(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
         """Return the received length of the recording; a permanent refusal is in the answer.
 
-        Raises LinkError for an invalid part, and if the robot must retry later.
+        Raises LinkError if the robot must retry later.
         """
-        part = decode_message(payload, ReplayPart)
         if part.total_bytes > MAX_FILE_BYTES:
             reason = f"a failure's recording of {part.total_bytes} bytes; the limit is {MAX_FILE_BYTES}"
             return FailureAck(id=part.id, refused=reason)

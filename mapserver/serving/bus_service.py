@@ -4,6 +4,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
@@ -40,10 +41,10 @@ MAX_REPORT_BYTES = 16 << 10  # a complete health report has 3 kB, a pose 0.5 kB
 # A robot's limit of messages, at once and per second: health once a second, poses with every frame, an ack per version.
 RENEWAL_RATE = (5, 1 / 60)  # per robot: each costs a signature and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
+REPORTS: dict[str, type[Any]] = {"ack": RobotAck, "health": RobotHealth, "pose": PoseMessage}
 _MOST_AREAS = 20  # told to a robot, the oldest requests first
 _CACHED_BYTES = 64_000_000
 _ENTRY_BYTES = 200  # overhead of a cache entry, so that empty ones are limited too
-MOST_SIGMA_M = 20.0  # of an operator's pose
 # Robots report every second. One without its liveliness token has left.
 _HEARD_WITHIN_S, _LEFT_S = 10.0, 3.0
 
@@ -137,6 +138,7 @@ class BusService:
     def _sender(self, key: str) -> tuple[str, str]:
         """Return site and robot of a robot's key; LinkError for one without permission, even if the bus let it through."""
         site, robot, _ = split_key(key)
+        check_name(site, "site")
         check_name(robot, "robot")
         if self._guard is not None and (site, robot) not in self._guard.access.robots:
             raise LinkError(
@@ -169,7 +171,7 @@ class BusService:
         site, robot = self._sender(key)
         part = decode_message(payload, ReplayPart)
         if part.survey is None:
-            return encode_message(self._fleet.replays.take(site, robot, payload))
+            return encode_message(self._fleet.replays.take(site, robot, part))
         if self._take_drive is None:
             return encode_message(FailureAck(id=part.id, refused="this server has no inbox for drives"))
         return encode_message(self._take_drive(site, robot, part))
@@ -201,12 +203,7 @@ class BusService:
             return "dropped"
         if len(payload) > MAX_REPORT_BYTES:
             raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
-        if what == "ack":
-            self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
-        elif what == "health":
-            self._fleet.take_health(site, robot, decode_message(payload, RobotHealth))
-        else:
-            self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
+        getattr(self._fleet, f"take_{what}")(site, robot, decode_message(payload, REPORTS[what]))
         return None
 
     def hear(self, keys: str, what: str, take: Callable[[str, bytes], str | None]) -> None:
@@ -240,14 +237,11 @@ def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPos
         raise StateError(f"{last} and is not connected; try again when it is back")
     if bus is None or bus.closed():
         raise StateError("this server has no bus to notify robots; start one with `mapserver serve`")
-    values = (told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m)
-    if not all(map(math.isfinite, values)) or not 0 < told.sigma_m <= MOST_SIGMA_M:
-        raise UsageError(f"x, y, heading and sigma must be numbers, sigma above 0 and at most {MOST_SIGMA_M:g} m")
     version = robot.version if robot.version is not None else None if current is None else current.version
     if version is None:
         raise StateError(f"{told.robot} runs no map yet; publish one first")
     manifest = store.manifest(told.site, version)
-    x, y = (math.floor(value / manifest.tile_size_m) for value in values[:2])
+    x, y = (math.floor(value / manifest.tile_size_m) for value in (told.x_map_m, told.y_map_m))
     if (x, y) not in {(tile.x, tile.y) for tile in manifest.tiles}:
         where = f"{told.x_map_m:.1f}, {told.y_map_m:.1f} m"
         raise UsageError(f"{where} is outside of version {version}: it has no tile {x},{y}")
@@ -268,16 +262,14 @@ class ByteCache:
     def get(self, sha256: str) -> bytes:
         """Return the bytes of an address, read if not cached; errors as of `read`."""
         with self._lock:
-            if (held := self._known(sha256)) is not None:
-                return held
             reading = self._reading.setdefault(sha256, threading.Lock())
         with reading:  # of one address alone: an object store may take seconds
-            with self._lock:
-                if (held := self._known(sha256)) is not None:
-                    return held
             try:
-                data = self._read(sha256)
                 with self._lock:
+                    data = self._held.get(sha256)
+                data = self._read(sha256) if data is None else data
+                with self._lock:
+                    self._held.pop(sha256, None)
                     self._held[sha256] = data
                     while self.total_bytes() > self._max_bytes:
                         del self._held[next(iter(self._held))]
@@ -285,11 +277,6 @@ class ByteCache:
                 with self._lock:
                     self._reading.pop(sha256, None)
             return data
-
-    def _known(self, sha256: str) -> bytes | None:
-        if (held := self._held.pop(sha256, None)) is not None:
-            self._held[sha256] = held
-        return held
 
     def total_bytes(self) -> int:
         return sum(len(data) + _ENTRY_BYTES for data in self._held.values())

@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from fleetmap.encoding import MOST
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.mapformat.names import NAME_PATTERN
 from mapserver.api.operations.operation import Caller, Done, operation
@@ -41,6 +42,12 @@ Endpoint = Annotated[
     typer.Option(metavar="ENDPOINT", help="Endpoint of the server; default: its certificate's first name."),
 ]
 Bundles = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")]
+Part = Annotated[str, {}]  # of an address alone
+_NUMBER = {"ge": -MOST, "le": MOST, "examples": [1.57]}
+Metres = Annotated[float, _NUMBER]
+Heading = Annotated[float | None, _NUMBER]
+Sigma = Annotated[float, {"gt": 0, "le": 20}]
+Corners = Annotated[list[tuple[float, float]], {"min_length": 3, "examples": [[[0, 0], [4, 0], [4, 3]]]}]
 of_robots = partial(operation, needs=Scope.ROBOTS)
 
 
@@ -146,6 +153,46 @@ def undo_areas(caller: Caller, site: Site) -> Done:
 
     areas = undo_areas(caller.store, site, caller.actor)
     return Done(f"site {site}: {len(areas.names)} areas, as before the last change", areas.geojson(site))
+
+
+@operation("/v1/sites/{site}/resurvey/requests", answer="Survey")
+def request_survey(caller: Caller, site: Site, corners_map_m: Corners) -> Done:
+    """Request a survey of a polygon; its tiles stay on the list until the request is closed. The first corner is not repeated."""
+    from mapserver.fleet.building import ask_for_survey
+
+    return Done("", ask_for_survey(caller.store, site, corners_map_m, caller.actor))
+
+
+@operation("/v1/sites/{site}/resurvey/requests/{asked}/end")
+def end_survey_request(caller: Caller, site: Site, asked: Part) -> Done:
+    """Remove a request from the list because it was surveyed or is no longer wanted."""
+    from mapserver.fleet.building import end_request
+
+    end_request(caller.store, site, asked, caller.actor)
+    return Done("")
+
+
+@operation("/v1/sites/{site}/robots/{robot}/initial_pose")
+def set_initial_pose(
+    caller: Caller,
+    site: Site,
+    robot: Part,
+    x_map_m: Metres,
+    y_map_m: Metres,
+    heading_rad: Heading = None,
+    sigma_m: Sigma = 0.5,
+) -> Done:
+    """Send an operator's pose to a robot: it overrides the tracked pose until fixes outweigh it. `ok`: the robot was notified.
+
+    Heading from x towards y; sigma: the uncertainty of x and of y.
+    """
+    from fleetmap.messages import InitialPoseMessage
+    from mapserver.serving.bus_service import place_robot
+
+    place: dict[str, Any] = {"x_map_m": x_map_m, "y_map_m": y_map_m, "heading_rad": heading_rad, "sigma_m": sigma_m}
+    told = InitialPoseMessage(site=site, robot=robot, **place)
+    place_robot(caller.store, caller.served.fleet, caller.served.bus, told, caller.actor)
+    return Done("")
 
 
 @of_robots("/v1/sites/{site}/robots/{robot}/remove", "robots remove")

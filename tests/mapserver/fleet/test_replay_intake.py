@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.messages import FailureAck, encode_message
+from fleetmap.messages import FailureAck
 from mapserver.fleet import replay_intake
 from mapserver.fleet.bounded_process import ProcessLimits
 from mapserver.fleet.fleet import Fleet
@@ -72,7 +72,7 @@ def test_a_part_that_is_lost_or_comes_twice_is_asked_for(server: Server, tmp_pat
 
     def send(offset: int, end: int) -> int:
         part = ReplayPart(id="f1", total_bytes=len(data), offset=offset, data=data[offset:end])
-        return server.fleet.replays.take("lab", "r1", encode_message(part)).received_bytes
+        return server.fleet.replays.take("lab", "r1", part).received_bytes
 
     assert send(1000, 2000) == 0, "from the beginning, please"
     assert [send(0, 1000), send(0, 1000), send(5000, 6000), send(1000, 1500)] == [1000, 1000, 1000, 1500]
@@ -123,13 +123,13 @@ def test_a_small_file_of_many_records_costs_little_and_nobody_waits_for_it(
     monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: held.wait(20.0))
     monkeypatch.setattr(replay_intake, "_ANSWER_WITHIN_S", 0.0)
     server.report("f3")
-    part = encode_message(ReplayPart(id="f3", total_bytes=1, offset=0, data=b"x"))
+    part = ReplayPart(id="f3", total_bytes=1, offset=0, data=b"x")
     for _ in range(2):
         with pytest.raises(LinkError, match="later: the recording is being judged"):
             server.fleet.replays.take("lab", "r1", part)
     server.report("f3", robot="r2")
     more = ReplayPart(id="f3", total_bytes=2, offset=0, data=b"x")
-    assert server.fleet.replays.take("lab", "r2", encode_message(more)).received_bytes == 1
+    assert server.fleet.replays.take("lab", "r2", more).received_bytes == 1
     held.set()
 
 
@@ -137,9 +137,7 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
     assert "send its report first" in server.send(small_file(tmp_path / "f.mcap")).refused
     server.report()
     part = ReplayPart(id="f1", total_bytes=1 << 30, offset=0, data=b"x")
-    assert "limit" in server.fleet.replays.take("lab", "r1", encode_message(part)).refused
-    with pytest.raises(LinkError):
-        server.fleet.replays.take("lab", "r1", b"no message")
+    assert "limit" in server.fleet.replays.take("lab", "r1", part).refused
 
 
 def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +145,7 @@ def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.Monke
     monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: ended)
     for number in range(replay_intake.MAX_UPLOADS + 1):
         server.report("f1", robot=f"r{number}")
-        part = encode_message(ReplayPart(id="f1", total_bytes=1000, offset=0, data=b"x"))
+        part = ReplayPart(id="f1", total_bytes=1000, offset=0, data=b"x")
         if number < replay_intake.MAX_UPLOADS:
             assert server.fleet.replays.take("lab", f"r{number}", part).received_bytes == 1
             continue

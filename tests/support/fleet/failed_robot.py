@@ -9,7 +9,7 @@ import msgspec
 
 from fleetmap.errors import LinkError
 from fleetmap.failure_summary import FailureSummary, Moment, ReplayPart
-from fleetmap.messages import PART_BYTES, FailureAck, FailureReport, encode_message
+from fleetmap.messages import PART_BYTES, FailureAck, FailureReport
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -99,7 +99,7 @@ def asked(fleet: Fleet, site: str, robot: str, part: ReplayPart) -> FailureAck:
     """The answer to a part, once the recording is judged."""
     while True:
         try:
-            return fleet.replays.take(site, robot, encode_message(part))
+            return fleet.replays.take(site, robot, part)
         except LinkError as error:
             if "being judged" not in str(error):
                 raise
