@@ -76,7 +76,7 @@ class Runtime:
         self._parts, self._manager = parts, manager
         self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
         self._links = () if parts.server is None else parts.server.links
-        self._stop, self._sensors_stop, self._disk_stop = (threading.Event() for _ in range(3))
+        self._stop, self._ending = threading.Event(), threading.Event()
         # Exchanged between threads: deques and plain values, which need no lock.
         self._bound = PositionBound()
         self._held: list[WantedVersion] = []
@@ -99,8 +99,7 @@ class Runtime:
 
     def stop(self) -> None:
         self._stop.set()
-        self._sensors_stop.set()
-        self._disk_stop.set()
+        self._ending.set()
 
     def run(self) -> None:
         """Localize on the calling thread until the end; then join all threads and write their data to the disk."""
@@ -125,8 +124,7 @@ class Runtime:
         self._manager.stopping()
         if self._server is not None:
             self._server.health.append(self._health())  # including the last frames
-        self._sensors_stop.set()
-        self._disk_stop.set()
+        self._ending.set()
         for name in ("sensors", "disk"):
             threads[name].join(_DRAIN_S)
         self._queue_failures()
@@ -274,14 +272,14 @@ class Runtime:
 
     def _run_sensors(self) -> None:
         try:
-            self._parts.source.run(self._parts.intake, self._sensors_stop.wait)
+            self._parts.source.run(self._parts.intake, self._ending.wait)
         finally:
             self._parts.intake.finish()
 
     def _run_disk(self) -> None:
         kept = [part.work for part in (self._parts.replays, self._parts.drives) if part is not None]
         jobs = Jobs(self._load_maps, self._queue_failures, *kept)
-        while not self._disk_stop.wait(_IDLE_S):
+        while not self._ending.wait(_IDLE_S):
             jobs.work()
 
     def _load_maps(self) -> None:

@@ -170,7 +170,8 @@ class Guard:
         if scope["method"] in {"GET", "HEAD", "OPTIONS"}:
             return None
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
-        if site not in {None, "same-origin", "none"} or (origin is not None and _netloc(origin) != host):
+        is_other = origin is not None and origin.lower().partition("://")[2] != host
+        if site not in {None, "same-origin", "none"} or is_other:
             return _refuse(scope, 403, "a page of another origin sent this request; open the server's own page")
         return None
 
@@ -251,13 +252,6 @@ def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | Non
 
 def _headers(scope: Scope) -> dict[str, str]:
     return {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-
-
-def _netloc(origin: str) -> str:
-    try:
-        return urlsplit(origin).netloc.lower()
-    except ValueError:
-        return ""
 
 
 def _is_secure(scope: Scope) -> bool:

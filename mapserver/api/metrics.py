@@ -181,7 +181,10 @@ class Metrics(Collector):
     def _sums(self, sites: Sequence[SiteInfo]) -> Iterator[Figure]:
         """Sums of sites, and of the versions and areas that are in the store; failures by cause."""
         versions = {(info.site, str(found.version)) for info in sites for found in self._store.versions(info.site)}
-        areas = {(info.site, name) for info in sites for name in (*self._area_names(info.site), OUTSIDE)}
+        areas = {(info.site, OUTSIDE) for info in sites}
+        for info in sites:
+            with suppress(FleetmapError):  # areas of a building plan, after the map's alignment was removed
+                areas |= {(info.site, name) for name in self._store.areas(info.site).names}
         for axis, kept in (("site", None), ("version", versions), ("area", areas)):
             for key, counts in self._store.fleet.counters(None, axis).items():
                 if kept is None or key in kept:
@@ -191,12 +194,6 @@ class Metrics(Collector):
                         yield f"{axis}_{name}", getattr(counts, column) / per, labels
         for (site, cause), counts in self._store.fleet.counters(None, "cause").items():
             yield "site_cause_failures", counts.failures + counts.suspected, {"site": site, "cause": cause}
-
-    def _area_names(self, site: str) -> list[str]:
-        try:
-            return self._store.areas(site).names
-        except FleetmapError:  # areas of a building plan, after the map's alignment was removed
-            return []
 
     def _disk(self) -> Iterator[Figure]:
         """No figures from a disk that does not answer."""

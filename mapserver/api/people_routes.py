@@ -1,5 +1,6 @@
 """Endpoints of operators, enrolled robots and the log. The guard requires the rights `operators` and `robots`, also for reading."""
 
+from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Query
@@ -22,13 +23,7 @@ def operators_of(store: MapStore) -> list[views.OperatorView]:
         view = views.TokenView(number=token.sha256[:12], scopes=token.scopes.split(), ends_ns=token.ends_ns)
         tokens.setdefault(token.name, []).append(view)
     return [
-        views.OperatorView(
-            name=row.name,
-            role=row.role,
-            is_disabled=bool(row.is_disabled),
-            sessions=row.sessions,
-            tokens=tokens.get(row.name, []),
-        )
+        views.OperatorView.model_validate(asdict(row) | {"tokens": tokens.get(row.name, [])})
         for row in Operators(store).all()
     ]
 

@@ -60,11 +60,9 @@ class SignInProxy:
         person: _Person | None = scope.get(_KEY)
         if person is None or self.clock_s() - person.seen_s > PAGE_S:
             return None
-        roles = {self.roles[group] for group in person.groups if group in self.roles}
-        if not roles:
-            return None
-        role = max(roles, key=list(Role).index)
-        return Identity(PREFIX + person.name, role, SCOPES[role], address)
+        roles = (self.roles[group] for group in person.groups if group in self.roles)
+        role = max(roles, key=list(Role).index, default=None)
+        return None if role is None else Identity(PREFIX + person.name, role, SCOPES[role], address)
 
 
 class ProxiedPeople:

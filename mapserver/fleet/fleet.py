@@ -1,7 +1,6 @@
 """State of the robots: wanted version, running version, last messages."""
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,10 +12,9 @@ from typing import Any
 import msgspec
 
 from fleetmap.encoding import to_plain
-from fleetmap.errors import LinkError, StoreError, UsageError
+from fleetmap.errors import LinkError, StoreError
 from fleetmap.files import write_atomically
 from fleetmap.mapformat.manifest import Name
-from fleetmap.mapformat.names import check_name
 from fleetmap.messages import (
     MAX_THUMBNAIL_BYTES,
     FailureAck,
@@ -38,7 +36,6 @@ from mapserver.store.files import check_no_link, make_folder
 from mapserver.store.rows import RobotInfo
 
 MAX_ROBOTS = 10_000
-MAX_STAMP_NS = 1 << 62  # limit of the store
 MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with text
 # A robot that fails more than once a minute is broken; 60 may be stored from an hour without a network.
 FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
@@ -146,10 +143,8 @@ class Fleet:
         self.prune = self._ingest.prune
         self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)
         self._failures = RateLimit(FAILURE_BURST, FAILURES_PER_S, clock_ns)
-        self._robots: dict[tuple[str, str], _Robot] = {}
+        self._robots = {(info.site, info.robot): _stored(info) for info in store.robots()}
         self.storage_fault = ""
-        for info in store.robots():
-            self._robots[info.site, info.robot] = _stored(info)
 
     def wanted_version(self, site: str, robot: str) -> WantedVersion:
         """Return the version that a robot should run: its site's current one, or the canary version.
@@ -161,7 +156,9 @@ class Fleet:
     def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
         """Return the same for all robots of a site that ever sent a message or query."""
         assignment = _assignment(self._store, site)
-        return {robot: assignment.wanted(robot) for robot in self.known_robots(site)}
+        with self._lock:
+            names = sorted(robot for of, robot in self._robots if of == site)
+        return {robot: assignment.wanted(robot) for robot in names}
 
     def take_question(self, site: str, robot: str) -> WantedVersion:
         """As `wanted_version`, queried by the robot itself: it is then registered, and notified of the next version."""
@@ -217,26 +214,19 @@ class Fleet:
         now_ns = self._clock_ns()
         try:
             _check_sender(site, robot, report)
-            check_name(robot, "robot")
-            if abs(report.wall_ns) > MAX_STAMP_NS or not 0 <= report.duration_s < math.inf:
-                raise LinkError(
-                    f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s: invalid time"
-                )
             for picture in report.thumbnails:
-                if abs(picture.stamp_ns) > MAX_STAMP_NS:
-                    raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
                 if not (picture.jpeg.startswith(b"\xff\xd8") and picture.jpeg.endswith(b"\xff\xd9")):
                     raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")
             with self._lock:
                 ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
-        except (LinkError, UsageError) as error:
+        except LinkError as error:
             return FailureAck(id=report.id, refused=str(error)[:2000])
         with self._storing():
             self._ingest.take_failure(report, now_ns, ahead_s)
         return FailureAck(id=report.id)
 
     def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
-        """As `take_failure`, of an encoded report. A permanently refused one is kept in the store's folder.
+        """As `take_failure`, of an encoded report; names as of `check_name`. A permanently refused one is kept in the store's folder.
 
         Raises LinkError for bytes without a readable report id, and above the robot's rate limit: it
         retries later; StoreError if a later attempt may succeed.
@@ -290,10 +280,6 @@ class Fleet:
         if self._ingest.has_counted():
             with self._storing():
                 self._ingest.flush()
-
-    def known_robots(self, site: str) -> list[str]:
-        with self._lock:
-            return sorted(robot for key_site, robot in self._robots if key_site == site)
 
     def robots(self, site: str | None = None) -> list[RobotStatus]:
         """Return all robots (of a site), by site and name."""
@@ -359,8 +345,6 @@ def _state(status: object) -> object:
 def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:
     if (message.site, message.robot) != (site, robot):
         raise LinkError(f"robot {robot!r} of {site!r} reports in the name of {message.robot!r} of {message.site!r}")
-    if abs(message.stamp_ns) > MAX_STAMP_NS:
-        raise LinkError(f"robot {robot!r} of {site!r} sent the stamp {message.stamp_ns} ns; check its clock")
 
 
 class _IdOnly(msgspec.Struct, frozen=True):
@@ -381,13 +365,9 @@ def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes,
     site, name = robot
     _log.warning("a failure of robot %r of site %r is permanently refused: %s", name[:80], site[:80], reason)
     try:
-        sender = f"{check_name(site, 'site')}-{check_name(name, 'robot')}"
-    except UsageError:
-        sender = "unknown"
-    try:
         check_no_link(folder.parent, folder)
         make_folder(folder)
-        path = folder / f"{moment}-{sender}.msgpack"
+        path = folder / f"{moment}-{site}-{name}.msgpack"
         write_atomically(path, [payload])
         write_atomically(path.with_suffix(".reason.txt"), [f"{reason}\n".encode("utf-8", "replace")])
         for old in sorted(folder.glob("*.msgpack"))[:-_MAX_KEPT]:

@@ -22,6 +22,7 @@ PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 _CANARIES_KEPT_NS = _AREAS_KEPT_NS = 1_000_000_000
 _LEAST_BETWEEN_TRACES_NS = 900_000_000
 _TRACE_STEP_M = 0.5
+_TRACED = {"radius_95_m": "radius_95_m", "frame_ms": "frame_ms_mean", "exposure": "exposure", "sharpness": "sharpness"}
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 
@@ -266,19 +267,8 @@ def arm_key(canary: int, *, is_canary: bool) -> str:
 
 
 def _trace(health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int) -> TraceRow:
-    return TraceRow(
-        site=health.site,
-        robot=health.robot,
-        hour=hour_of(now_ns),
-        stamp_ns=health.stamp_ns,
-        status=health.status,
-        version=health.version,
-        x_map_m=None if place is None else place[0],
-        y_map_m=None if place is None else place[1],
-        radius_95_m=number_of(health.metrics.get("radius_95_m")),
-        heard_ns=now_ns,
-        flags=",".join(health.flags) or None,
-        frame_ms=number_of(health.metrics.get("frame_ms_mean")),
-        exposure=number_of(health.metrics.get("exposure")),
-        sharpness=number_of(health.metrics.get("sharpness")),
-    )
+    row: dict[str, Any] = {name: getattr(health, name) for name in ("site", "robot", "stamp_ns", "status", "version")}
+    row |= {name: number_of(health.metrics.get(metric)) for name, metric in _TRACED.items()}
+    x_m, y_m = (None, None) if place is None else place[:2]
+    row |= {"hour": hour_of(now_ns), "heard_ns": now_ns, "flags": ",".join(health.flags) or None}
+    return TraceRow(**row, x_map_m=x_m, y_map_m=y_m)

@@ -14,6 +14,7 @@ from fleetmap.failure_definition import (
 )
 from fleetmap.messages import Flag, PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Counters
+from mapserver.fleet_statistics.robot_calibration import number_of
 
 _WINDOW_NS = 60_000_000_000  # of the clock's offset
 MAX_GAP_S = 5.0  # during a longer silence a robot counts as unobserved
@@ -154,11 +155,8 @@ class HealthStream:
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:
-    return {
-        name: float(value)
-        for name, value in health.metrics.items()
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_FIGURE
-    }
+    numbers = {name: number_of(value) for name, value in health.metrics.items()}
+    return {name: number for name, number in numbers.items() if number is not None and abs(number) < _MAX_FIGURE}
 
 
 class ClockSkew:

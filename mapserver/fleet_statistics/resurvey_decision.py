@@ -74,13 +74,12 @@ def concerns(
         if "," not in tile:
             continue
         then = before.get(tile, Counters())
-        reasons = _rising(now, then, total, settings, tests)
-        new, old = kpis(now).landmarks_seen_share, kpis(then).landmarks_seen_share
+        concern = concern_of(tile, _rising(now, then, total, settings, tests), now, then)
+        new, old = concern.landmarks_seen_share, concern.landmarks_seen_share_before
         is_seen = min(now.landmarks_expected, then.landmarks_expected) >= _MIN_LANDMARKS
         if new is not None and old is not None and is_seen and new < old - settings.fading:
-            reasons.append(f"{new:.0%} of the landmarks are found, {old:.0%} before")
-        if reasons:
-            found.append(concern_of(tile, reasons, now, then))
+            concern.reasons.append(f"{new:.0%} of the landmarks are found, {old:.0%} before")
+        found += [concern] if concern.reasons else []
     return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
 
 

@@ -7,7 +7,7 @@ Passwords are hashed by argon2 with the low-memory profile of RFC 9106, section 
 import hashlib
 import secrets
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -122,11 +122,8 @@ class Operators:
             self.note("sign-in refused", "wrong name or password", who)
             return SignIn(refusal="Wrong name or password.")
         session = secrets.token_urlsafe(32)
-        self._store.operators.begin_session(_digest(session), name, Actor(name, "", name, address))
-        now_ns = self._now_ns()
-        self._store.operators.remove_ended(
-            begun_before_ns=now_ns - LIFE_S * 10**9, used_before_ns=now_ns - IDLE_S * 10**9
-        )
+        who, kept = replace(who, operator=name), {"life_ns": LIFE_S * 10**9, "idle_ns": IDLE_S * 10**9}
+        self._store.operators.begin_session(_digest(session), who, **kept)
         return SignIn(session)
 
     def sign_out(self, who: Identity) -> None:

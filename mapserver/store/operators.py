@@ -77,10 +77,16 @@ class OperatorQueries:
         query = f"SELECT name, role, begun_ns, used_ns FROM sessions {_IF_ENABLED}"
         return next(iter(self._database.rows(SessionRow, query, (sha256,))), None)
 
-    def begin_session(self, sha256: str, name: str, actor: Actor) -> None:
+    def begin_session(self, sha256: str, actor: Actor, *, life_ns: int, idle_ns: int) -> None:
+        """Begin a session of the actor. Those that are too old are removed, and tokens that ended long ago, but not those ended only by a
+        clock far ahead."""
         now_ns = self._database.now_ns()
-        with self._changing("signed in", name, actor) as change:
-            change.insert("sessions", [{"sha256": sha256, "name": name, "begun_ns": now_ns, "used_ns": now_ns}])
+        with self._changing("signed in", actor.name, actor) as change:
+            row = {"sha256": sha256, "name": actor.name, "begun_ns": now_ns, "used_ns": now_ns}
+            change.insert("sessions", [row])
+            old = "DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?"
+            change.execute(old, (now_ns - life_ns, now_ns - idle_ns))
+            change.execute("DELETE FROM tokens WHERE ends_ns < ?", (now_ns - _TOKENS_KEPT_NS,))
 
     def use_session(self, sha256: str, now_ns: int) -> None:
         with self._database.write(durable=False) as change:
@@ -89,12 +95,6 @@ class OperatorQueries:
     def end_session(self, sha256: str, actor: Actor) -> None:
         with self._changing("signed out", actor.name, actor) as change:
             change.execute("DELETE FROM sessions WHERE sha256 = ?", (sha256,))
-
-    def remove_ended(self, *, begun_before_ns: int, used_before_ns: int) -> None:
-        """Remove sessions that are too old, and tokens that ended long ago, but not those ended only by a clock far ahead."""
-        with self._database.write(durable=False) as change:
-            change.execute("DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", (begun_before_ns, used_before_ns))
-            change.execute("DELETE FROM tokens WHERE ends_ns < ?", (self._database.now_ns() - _TOKENS_KEPT_NS,))
 
     def token(self, sha256: str) -> TokenRow | None:
         """Return the token of this hash, unless its operator is disabled; the caller checks its end."""

@@ -35,19 +35,17 @@ class UsageMeter:
 
     def __init__(self, root: Path, database: Database, blobs: Blobs) -> None:
         self._root, self._database, self._blobs = root, database, blobs
-        self._lock, self._due_s = threading.Lock(), 0.0
-        self._thread: threading.Thread | None = None
+        self._lock, self._due_s, self._thread = threading.Lock(), 0.0, threading.Thread()
         self._last: StoreUsage | None = None
 
     def look(self) -> StoreUsage | None:
         """Return the last measurement; None while the first is under way, or if the disk refuses it."""
         with self._lock:
-            if self._thread is None and time.monotonic() >= self._due_s:
+            if not self._thread.is_alive() and time.monotonic() >= self._due_s:
+                self._due_s = time.monotonic() + _EVERY_S
                 self._thread = threading.Thread(target=self._measure, name="store usage", daemon=True)
                 self._thread.start()
-            thread = self._thread
-        if thread is not None:
-            thread.join(_WAIT_S)
+        self._thread.join(_WAIT_S)
         return self._last
 
     def _measure(self) -> None:
@@ -62,9 +60,6 @@ class UsageMeter:
                 self._last = StoreUsage(self._database.now_ns(), *sizes)
         except FleetmapError as error:
             _log.warning("%s", error)
-        finally:
-            with self._lock:
-                self._thread, self._due_s = None, time.monotonic() + _EVERY_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -309,7 +309,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     id: Name
     stamp_ns: int
     wall_ns: int
-    duration_s: float
+    duration_s: Annotated[float, msgspec.Meta(ge=0)]
     kind: Name
     status: Name
     cause: Name
