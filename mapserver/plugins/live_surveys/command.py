@@ -2,8 +2,8 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,11 +17,8 @@ from mapserver.commands.options import SurveyOptions, open_store
 
 if TYPE_CHECKING:
     from fleetmap.bus.zenoh_bus import Bus
-    from mapserver import BuildOptions
-    from mapserver.config import MapserverConfig
     from mapserver.plugins.live_surveys.drives import Drive
     from mapserver.plugins.live_surveys.message import LiveSurveyState
-    from mapserver.survey.settings import SurveySettings
 _LOOPBACK = "127.0.0.1"
 
 
@@ -67,67 +64,38 @@ def live(
     from fleetmap.console import plain_console
     from fleetmap.plugins.viewer_channels import require_foxglove
     from fleetmap.recordings.sensor_subset import named_sensor_set
-    from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+    from fleetmap.sources.source import open_source
+    from mapserver.drafting.draft import BuildRequest
+    from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
+    from mapserver.plugins.live_surveys.live_survey import run_live
 
-    at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     use = None if options.use is None else named_sensor_set(options.use)
     build, stopped = options.build_options(context, use=use), _stopping()
     tells, see = list[Callable[["LiveSurveyState"], None]](), None
     with ExitStack() as opened:
-        if at is not None:
+        if options.foxglove is not None:
+            at = viewer_address(options.foxglove, insecure=options.insecure)
             require_foxglove("--foxglove")
             from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
 
             foxglove = opened.enter_context(FoxgloveServer(*at, options.site))
             typer.echo(f"foxglove: {foxglove.url}")
-        drive, settings = opened.enter_context(
-            _played(recording, build, options.speed)
-            if recording is not None
-            else _driven(context.obj.read_config(sensors)[0], options.record, build)
-        )
-        if at is not None:
+        paths = tuple(path for path in (recording, options.record) if path is not None)
+        request = BuildRequest(paths, options.site, options.store, build)
+        if recording is not None:
+            read, indices = build.opened(recording)
+            drive: Drive = RecordedDrive(request, opened.enter_context(read), indices, options.speed)
+        else:
+            given = context.obj.read_config(sensors)[0]
+            drive = SensorDrive(request, open_source(given.source, given.topics), given.topics)
+        if options.foxglove is not None:
             viewer = LiveViewer(foxglove, drive)
             tells, see = [viewer.tell], viewer.see
         if options.server is not None:
             tells.append(partial(_publish, opened.enter_context(_bus(options.server, options.store))))
-        request = LiveRequest(options.site, options.store, settings, build)
-
-        def tell(state: "LiveSurveyState") -> None:
-            for each in tells:
-                each(state)
-
-        figures, built = run_live(request, drive, tell, stopped.is_set, plain_console(stderr=True), see)
+        figures, built = run_live(drive, tells, stopped.is_set, plain_console(stderr=True), see)
     typer.echo(figures.words())
     typer.echo(built.sentence)
-
-
-@contextmanager
-def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[tuple[Drive, SurveySettings]]":
-    """Return a recording, and the settings for its sensors."""
-    from mapserver.config import survey_settings
-    from mapserver.plugins.live_surveys.drives import RecordedDrive
-
-    opened, indices = build.opened(recording)
-    with opened:
-        settings = survey_settings(build.config, opened.sensor_set)
-        yield RecordedDrive(recording, opened, indices, build.frames, speed), settings
-
-
-@contextmanager
-def _driven(
-    given: "MapserverConfig", record: Path | None, build: "BuildOptions"
-) -> "Iterator[tuple[Drive, SurveySettings]]":
-    """Return the sensors named in a configuration file, and their settings; errors of `open_source`."""
-    from fleetmap.recordings.recording import sensors_of_view
-    from fleetmap.sources.source import open_source
-    from mapserver.config import survey_settings
-    from mapserver.plugins.live_surveys.drives import SensorDrive
-
-    assert record is not None
-    drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
-    rig = drive.calibration
-    sensors = sensors_of_view(len(rig.cameras) > 1, drive.has_depth, rig.imu is not None)
-    yield drive, survey_settings(build.config, sensors)
 
 
 def _stopping() -> threading.Event:

@@ -5,7 +5,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +14,16 @@ from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.recordings import Recording, StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.recordings.recording import sensors_of_view
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, SensorSet, WheelSample
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetmap.sources.source import Source
+from mapserver.config import survey_settings
 from mapserver.drafting.admission import refuse_hopeless
-from mapserver.drafting.draft import BuildOptions
+from mapserver.drafting.draft import BuildOptions, BuildRequest
 from mapserver.drafting.worker import read_ahead
 from mapserver.survey.odometry_pass import SampleFeed
 
@@ -44,12 +45,16 @@ class DueFrame(NamedTuple):
 
 
 class Drive(ABC):
-    """A survey's frames in time, at `speed` times the rate of their stamps. dropped: frames that arrived too fast."""
+    """A survey's frames in time, at `speed` times the rate of their stamps. request: for a draft of all of them; settings: of its survey;
+    dropped: frames that arrived too fast."""
 
-    def __init__(self, name: str, calibration: RigCalibration, *, has_depth: bool, speed: float) -> None:
-        self.name, self.calibration, self.has_depth, self.speed = name, calibration, has_depth, speed
-        self.rectifier = Rectifier(calibration, has_depth=has_depth)
-        self.dropped = 0
+    def __init__(
+        self, request: BuildRequest, name: str, calibration: RigCalibration, sensors: SensorSet, speed: float
+    ) -> None:
+        self.name, self.calibration, self.speed, self.dropped = name, calibration, speed, 0
+        self.settings = survey_settings(request.options.config, sensors)
+        self.request = replace(request, options=replace(request.options, settings=self.settings))
+        self.rectifier = Rectifier(calibration, has_depth=sensors is SensorSet.RGBD)
 
     def check(self) -> list[str]:
         """Return shortcomings as text; RecordingError for what a build would refuse, as far as known before the drive."""
@@ -60,21 +65,19 @@ class Drive(ABC):
         """Yield each frame when it is due; None from time to time while waiting."""
 
     @abstractmethod
-    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
-        """Return the recording, and the build options that select the `count` used frames."""
+    def finish(self, count: int) -> BuildOptions:
+        """Return the options of a build of the `count` used frames."""
 
 
 class RecordedDrive(Drive):
     """A recording, played at `speed` times its own rate; 0 for as fast as its frames are processed."""
 
-    def __init__(self, path: Path, recording: Recording, indices: NDArray[np.int64], given: str, speed: float) -> None:
-        """given: the `--frames` option of the indices."""
+    def __init__(self, request: BuildRequest, recording: Recording, indices: NDArray[np.int64], speed: float) -> None:
+        """recording, indices: what the request names, opened."""
         if not (np.isfinite(speed) and speed >= 0):
             raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")
-        recording = recording.view(0)
-        has_depth = recording.sensor_set is SensorSet.RGBD
-        super().__init__(recording.name, recording.calibration, has_depth=has_depth, speed=speed)
-        self._path, self._recording, self._indices, self._given = path, recording, indices, given
+        self._recording, self._indices = recording.view(0), indices
+        super().__init__(request, recording.name, self._recording.calibration, recording.sensor_set, speed)
 
     def check(self) -> list[str]:
         refuse_hopeless(self._recording)
@@ -85,7 +88,8 @@ class RecordedDrive(Drive):
         recording, begin_s = self._recording, time.monotonic() + _BEGIN_S
         feed = SampleFeed(recording.imu, recording.wheel, self.rectifier.imu_minus_cam_s)
         first_ns = int(recording.frame_stamps_ns[self._indices[0]])
-        for frame in read_ahead((self._frame(int(index)) for index in self._indices), _AHEAD):
+        rectified = (self.rectifier.rectify(recording.read_frame(int(index))) for index in self._indices)
+        for frame in read_ahead(rectified, _AHEAD):
             due_s = None
             if self.speed:
                 due_s = begin_s + (frame.stamp_ns - first_ns) * 1e-9 / self.speed
@@ -93,32 +97,31 @@ class RecordedDrive(Drive):
             imu, wheel = feed.until(frame.stamp_ns)
             yield DueFrame(frame, imu, list(wheel), due_s)
 
-    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+    def finish(self, count: int) -> BuildOptions:
         if count == len(self._indices):
-            return self._path, replace(options, frames=self._given)
+            return self.request.options
         seen = self._indices[: max(count, 1)]
         step = int(self._indices[1] - self._indices[0]) if len(self._indices) > 1 else 1
-        return self._path, replace(options, frames=f"{int(seen[0])}:{int(seen[-1]) + 1}:{step}")
-
-    def _frame(self, index: int) -> RectifiedFrame:
-        return self.rectifier.rectify(self._recording.read_frame(index))
+        return replace(self.request.options, frames=f"{int(seen[0])}:{int(seen[-1]) + 1}:{step}")
 
 
 class SensorDrive(Drive):
     """The sensors of a robot, judged by their data. Every sample is recorded; after a crash the file lacks at most the last second."""
 
-    def __init__(self, source: Source, path: Path, topics: Topics) -> None:
-        """path: of the MCAP file to write; UsageError if it exists."""
+    def __init__(self, request: BuildRequest, source: Source, topics: Topics) -> None:
+        """request: of the MCAP file to write; UsageError if it exists."""
+        (path,), rig = request.recordings, source.calibration
         if path.suffix != ".mcap" or path.exists():
             raise UsageError(f"--record {path}: name a new file that ends in .mcap")
-        super().__init__(path.stem, source.calibration, has_depth=source.has_depth, speed=1.0)
+        sensors = sensors_of_view(len(rig.cameras) > 1, source.has_depth, rig.imu is not None)
+        super().__init__(request, path.stem, rig, sensors, 1.0)
         self._source, self._path, self._topics = source, path, topics
         self._ended, self._recorded_frames = threading.Event(), 0
         self._fault: Exception | None = None
         self._intake = Intake(
             frames=_QUEUE,
             imu_minus_cam_s=self.rectifier.imu_minus_cam_s,
-            has_imu=source.calibration.imu is not None,
+            has_imu=rig.imu is not None,
             imu_wait_s=_IMU_WAIT_S,
         )
 
@@ -148,18 +151,18 @@ class SensorDrive(Drive):
             else:
                 writer.discard()
 
-    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+    def finish(self, count: int) -> BuildOptions:
         if not count:
             self._refuse_silence()
             raise RecordingError(
                 f"no frame could be used; check the sensors with `locclient check`{self._unreadable()}"
             )
-        return self._path, replace(options, frames="::", calibration=None, topics=self._topics, use=None)
+        return replace(self.request.options, frames="::", calibration=None, topics=self._topics, use=None)
 
     def _refuse_silence(self) -> None:
         """Raise RecordingError if cameras or IMU have sent nothing, with their expected topics."""
         counts, topics = self._intake.counts, self._topics
-        second = topics.depth if self.has_depth else topics.right if len(self.calibration.cameras) > 1 else ""
+        second = topics.depth if self._source.has_depth else topics.right if len(self.calibration.cameras) > 1 else ""
         if not counts.frames:
             images = f"{topics.left} and {second}" if second else topics.left
             raise RecordingError(

@@ -7,8 +7,6 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -24,7 +22,6 @@ from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import Image, ImuSamples, WheelSample
-from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
@@ -120,68 +117,49 @@ Tell = Callable[[LiveSurveyState], None]
 See = Callable[[Tracked], None]
 
 
-@dataclass(frozen=True)
-class LiveRequest:
-    """A requested live survey. options: of the build at its end."""
-
-    site: str
-    store: Path
-    settings: SurveySettings
-    options: BuildOptions = field(default_factory=BuildOptions)
-
-
 class LiveFigures(NamedTuple):
-    """Timing of the survey: frames and their duration; 0.5 and 0.99 of the frames were processed within latency_ms, None
-    if not played in real time; late_frames took longer than a frame period. most_behind: largest queue of keyframes;
-    lag_s: longest time from a keyframe to the map that shows it. dropped: frames that arrived too fast.
-    """
+    """A survey's state, and how well mapping kept up. most_behind: largest queue of keyframes; lag_s: longest time from a keyframe to the
+    map that shows it. dropped: frames that arrived too fast."""
 
-    frames: int
-    seconds: float
-    keyframes: int
-    latency_ms: tuple[float, float] | None
-    late_frames: int
+    state: LiveSurveyState
     most_behind: int
     lag_s: float
     dropped: int
-    loops: int
-    parts: int
     mapping_failed: str
 
     def words(self) -> str:
-        failed = self.mapping_failed
+        state, failed = self.state, self.mapping_failed
         kept = "played as fast as possible"
-        if self.latency_ms is not None:
-            kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
-        made = f"{self.loops} loops" + (f" in {self.parts} separate parts" if self.parts > 1 else "")
+        if state.latency_ms is not None:
+            kept = f"answered within {state.latency_ms:.0f} ms (99 %), {state.late_frames} late"
+        made = f"{state.loops} loops" + (f" in {len(state.parts)} separate parts" if len(state.parts) > 1 else "")
         return (
-            f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
-            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
+            f"live: {state.frames} frames of {state.seconds:.1f} s, {kept}, {self.dropped} dropped; {state.keyframes} keyframes, mapping "
+            f"at most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
         )
 
 
 def run_live(
-    request: LiveRequest,
     drive: Drive,
-    tell: Tell,
+    tells: Sequence[Tell],
     is_stopped: Callable[[], bool],
     console: Console,
     see: See | None = None,
 ) -> tuple[LiveFigures, BuiltMap]:
     """Run a survey to its end, or until it is stopped; return the figures of the drive, and the draft built from it.
 
-    tell: receives the state, twice a second; see: receives every frame, and returns at once. Raises the FleetmapErrors of a build,
+    tells: receive the state, twice a second; see: receives every frame, and returns at once. Raises the FleetmapErrors of a build,
     before the drive if possible.
     """
-    survey = _Survey(request, drive, tell, see)
+    survey = _Survey(drive, tells, see)
     try:
         for remark in survey.check():
             console.print(remark, markup=False)
         survey.follow(is_stopped)
         console.print(survey.figures().words(), markup=False)
-        path, options = drive.finish(survey.figures().frames, replace(request.options, settings=request.settings))
+        options = drive.finish(survey.figures().state.frames)
         survey.say("adjusting")
-        built = build_map(path, request.store, request.site, options)
+        built = build_map(drive.request.recordings, drive.request.store, drive.request.site, options)
     except FleetmapError as error:
         survey.say("failed", words=str(error))
         raise
@@ -192,8 +170,8 @@ def run_live(
 class _Survey:
     """One survey during its drive, with its present figures."""
 
-    def __init__(self, request: LiveRequest, drive: Drive, tell: Tell, see: See | None) -> None:
-        self._request, self._drive, self._tell, self._see = request, drive, tell, see
+    def __init__(self, drive: Drive, tells: Sequence[Tell], see: See | None) -> None:
+        self._drive, self._tells, self._see = drive, tells, see
         self._stamps_ns: list[int] = []
         self._latencies_s: list[float] = []
         self._qualities: list[float] = []  # of each keyframe, the worst since the previous one
@@ -205,8 +183,8 @@ class _Survey:
 
     def check(self) -> list[str]:
         """Return shortcomings before the start as text; FleetmapErrors for a survey certain to fail."""
-        remarks, request = self._drive.check(), self._request
-        self._config = SurveyConfig(request.settings, default_vocabulary(), read_zones(request.options.zones))
+        remarks, zones = self._drive.check(), read_zones(self._drive.request.options.zones)
+        self._config = SurveyConfig(self._drive.settings, default_vocabulary(), zones)
         if not self._scale_known and self._drive.calibration.imu is None:
             remarks.append(
                 "scale: unknown: one camera without an IMU shows no metres; the draft can be inspected, and published only if docks or "
@@ -219,7 +197,7 @@ class _Survey:
         drive, told_s = self._drive, 0.0
         # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
         with _one_thread(), closing(self._mapping.start(self._config)):
-            tracking = LiveTracking(drive.calibration, drive.rectifier, self._request.settings)
+            tracking = LiveTracking(drive.calibration, drive.rectifier, drive.settings)
             with closing(drive.frames()) as frames:
                 for due in frames:
                     if is_stopped():
@@ -245,53 +223,38 @@ class _Survey:
             self._worst = 1.0
 
     def figures(self) -> LiveFigures:
-        latency, sketch = None, self._mapping.sketch  # which the thread of mapping replaces
-        if self._latencies_s:
-            median, high = np.percentile(self._latencies_s, [50, 99]) * 1e3
-            latency = round(float(median), 2), round(float(high), 2)
-        return LiveFigures(
-            frames=len(self._stamps_ns),
-            seconds=(self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0,
-            keyframes=len(self._qualities),
-            latency_ms=latency,
-            late_frames=self._late(),
-            most_behind=self._mapping.most_behind,
-            lag_s=round(self._mapping.longest_lag_s, 3),
-            dropped=self._drive.dropped,
-            loops=sketch.loops,
-            parts=len(sketch.parts),
-            mapping_failed=self._mapping.failed,
-        )
-
-    def _late(self) -> int:
-        """Return the number of frames processed later than the time to the next frame."""
-        if len(self._latencies_s) < 2:
-            return 0
-        latencies_s, stamps_ns = np.array(self._latencies_s), np.array(self._stamps_ns)
-        return int(np.sum(latencies_s > float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed))
+        mapping = self._mapping
+        lag_s = round(mapping.longest_lag_s, 3)
+        return LiveFigures(self.state("tracking"), mapping.most_behind, lag_s, self._drive.dropped, mapping.failed)
 
     def say(self, phase: str, *, version: int | None = None, words: str = "") -> None:
-        figures, sketch = self.figures(), self._mapping.sketch
+        state = self.state(phase, version, words)
+        for tell in self._tells:
+            tell(state)
+
+    def state(self, phase: str, version: int | None = None, words: str = "") -> LiveSurveyState:
+        sketch, stamps_ns = self._mapping.sketch, self._stamps_ns or [0]  # the thread of mapping replaces the sketch
         qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
-        mapped = structs.asdict(sketch) | {"keyframes": figures.keyframes}
-        self._tell(
-            LiveSurveyState(
-                **mapped,
-                site=self._request.site,
-                recording=self._drive.name[:200],
-                stamp_ns=self._stamps_ns[-1] if self._stamps_ns else 0,
-                phase=phase,
-                seconds=round(figures.seconds, 3),
-                frames=figures.frames,
-                behind=self._mapping.behind,
-                latency_ms=None if figures.latency_ms is None else figures.latency_ms[1],
-                late_frames=figures.late_frames,
-                quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
-                scale_known=self._scale_known,
-                picture=self._picture(),
-                version=version,
-                words=(words or figures.mapping_failed)[:2000],
-            )
+        latencies_s, late_frames = np.array(self._latencies_s), 0
+        if len(latencies_s) > 1:  # processed later than the time to the next frame
+            period_s = float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed
+            late_frames = int(np.sum(latencies_s > period_s))
+        return LiveSurveyState(
+            **structs.asdict(sketch) | {"keyframes": len(self._qualities)},
+            site=self._drive.request.site,
+            recording=self._drive.name[:200],
+            stamp_ns=stamps_ns[-1],
+            phase=phase,
+            seconds=round((stamps_ns[-1] - stamps_ns[0]) * 1e-9, 3),
+            frames=len(self._stamps_ns),
+            behind=self._mapping.behind,
+            latency_ms=round(float(np.percentile(latencies_s, 99) * 1e3), 2) if len(latencies_s) else None,
+            late_frames=late_frames,
+            quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
+            scale_known=self._scale_known,
+            picture=self._picture(),
+            version=version,
+            words=(words or self._mapping.failed)[:2000],
         )
 
     def _picture(self) -> bytes:

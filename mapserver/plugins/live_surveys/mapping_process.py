@@ -38,9 +38,6 @@ _MOST_MISSING = 64
 _NICENESS = 5  # lower priority than tracking
 
 
-_Item = tuple[RectifiedFrame, NewKeyframe]
-
-
 class MappingProcess:
     """The process and its communication threads, from `start` until `close`."""
 
@@ -50,7 +47,7 @@ class MappingProcess:
         # Its arguments go through the pipe: larger process arguments would block for ever if the process dies.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
         self._theirs, self._rectifier = theirs, rectifier
-        self._waiting: queue.Queue[_Item | None] = queue.Queue()
+        self._waiting: queue.Queue[tuple[RectifiedFrame, NewKeyframe] | None] = queue.Queue()
         self._sent = self.most_behind = 0
         self.sketch = MapSketch(keyframes=0)  # after the newest processed keyframe
         self.failed = ""  # why no more keyframes are accepted

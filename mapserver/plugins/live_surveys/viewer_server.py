@@ -19,17 +19,7 @@ from fleetmap.geometry import Array
 from fleetmap.log_lines import LogLimit
 from fleetmap.messages import EstimateMessage
 from fleetmap.plugins.viewer_channels import channels
-from fleetmap.plugins.viewer_channels.channels import (
-    BASE,
-    CAMERA,
-    CHANNELS,
-    ODOM,
-    SURVEY,
-    ChannelMessage,
-    RobotMark,
-    Shown,
-    encoding_of,
-)
+from fleetmap.plugins.viewer_channels.channels import BASE, CAMERA, ODOM, SURVEY, ChannelMessage, Shown
 from mapserver.plugins.live_surveys.drives import Drive
 from mapserver.plugins.live_surveys.live_survey import Tracked
 from mapserver.plugins.live_surveys.message import LiveSurveyState
@@ -53,8 +43,8 @@ class FoxgloveServer(ServerListener):
         self._context = Context()
         # All before any viewer connects: an early subscription to a channel that is created later may be refused as unknown.
         self._channels = {
-            topic: Channel(topic, schema=schema, message_encoding=encoding_of(schema), context=self._context)
-            for topic, schema in CHANNELS.items()
+            topic: Channel(topic, schema=schema, message_encoding=channels.encoding_of(schema), context=self._context)
+            for topic, schema in channels.CHANNELS.items()
         }
         self._waiting: dict[str, deque[Shown]] = {}
         self._last: dict[str, Shown] = {}
@@ -181,11 +171,11 @@ class LiveViewer:
 
     def _placed(self, estimate: EstimateMessage, name: str) -> list[Shown]:
         odom_from_base, stamp_ns = estimate.odom_from_base.target_from_source, estimate.stamp_ns
-        joined, marks = [(ODOM, BASE, odom_from_base), (BASE, CAMERA, self._base_from_cam)], list[RobotMark]()
+        joined, marks = [(ODOM, BASE, odom_from_base), (BASE, CAMERA, self._base_from_cam)], list[channels.RobotMark]()
         if estimate.map_from_odom is not None:
             map_from_odom = estimate.map_from_odom.target_from_source
             joined.append((SURVEY, ODOM, map_from_odom))
-            marks.append(RobotMark(name, map_from_odom @ odom_from_base, estimate.status))
+            marks.append(channels.RobotMark(name, map_from_odom @ odom_from_base, estimate.status))
         return [
             Shown("/survey/robot", stamp_ns, lambda: channels.robots(stamp_ns, marks, "/survey/robot", SURVEY)),
             Shown("/tf", stamp_ns, lambda: channels.links(stamp_ns, joined)),

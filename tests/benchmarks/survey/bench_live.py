@@ -12,21 +12,20 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
-from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildOptions
-from mapserver.drafting.survey_recordings import RecordingOptions
+from mapserver.drafting.draft import BuildOptions, BuildRequest
 from mapserver.plugins.live_surveys.drives import RecordedDrive
-from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+from mapserver.plugins.live_surveys.live_survey import run_live
 
 
 def bench(path: Path) -> dict[str, Any]:
     """Figures of a recording, played at its own speed."""
-    opened, indices = RecordingOptions().opened(path)
+    opened, indices = BuildOptions().opened(path)
     with tempfile.TemporaryDirectory() as folder, opened:
-        settings = survey_settings(None, opened.sensor_set)
-        drive = RecordedDrive(path, opened, indices, "::", 1.0)
-        request = LiveRequest("live", Path(folder) / "store", settings, BuildOptions())
-        return run_live(request, drive, lambda _: None, lambda: False, Console(quiet=True))[0]._asdict()
+        drive = RecordedDrive(BuildRequest((path,), "live", Path(folder) / "store"), opened, indices, 1.0)
+        figures = run_live(drive, [], lambda: False, Console(quiet=True))[0]._asdict()
+        state = figures.pop("state")
+        told = ("frames", "seconds", "keyframes", "latency_ms", "late_frames", "loops")
+        return {name: getattr(state, name) for name in told} | figures | {"parts": len(state.parts)}
 
 
 @benchmark(several="recordings")

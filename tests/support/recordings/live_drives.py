@@ -1,6 +1,6 @@
 """Surveys under way in a test: recordings that are played for a kind of rig, and mapping without a process of its own."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +14,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from mapserver.drafting.draft import BuildOptions
-from mapserver.drafting.survey_recordings import RecordingOptions
+from mapserver.drafting.draft import BuildOptions, BuildRequest
 from mapserver.plugins.live_surveys import live_survey
 from mapserver.plugins.live_surveys.drives import RecordedDrive
 from mapserver.plugins.live_surveys.live_map import LiveMap
@@ -63,8 +62,8 @@ def order_builds(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
     """The builds that are ordered from now on and not done; mapping is done in this process."""
     ordered: list[Call] = []
 
-    def build_map(*call: Any) -> object:
-        ordered.append(call)
+    def build_map(recordings: Sequence[Path], *call: Any) -> object:
+        ordered.append((*recordings, *call))
         return type("Built", (), {"version": 1, "sentence": "built"})()
 
     monkeypatch.setattr(live_survey, "MappingProcess", MappingHere)
@@ -89,12 +88,13 @@ def laid_on_truth(map_from_body: Array, sample: Sample, frames: list[int]) -> La
 
 @contextmanager
 def played(
-    recording: Path, frames: str = "::", speed: float = 1.0, use: SensorSet | None = None
+    recording: Path, store: Path, frames: str = "::", speed: float = 1.0, use: SensorSet | None = None
 ) -> Iterator[RecordedDrive]:
-    """A recording, or the sensors `use` of it, as a drive."""
-    opened, indices = RecordingOptions(frames, use=use).opened(recording)
+    """A recording, or the sensors `use` of it, as a drive for a draft of the site `lab`."""
+    options = BuildOptions(frames, use=use)
+    opened, indices = options.opened(recording)
     with opened:
-        yield RecordedDrive(recording, opened, indices, frames, speed)
+        yield RecordedDrive(BuildRequest((recording,), "lab", store, options), opened, indices, speed)
 
 
 def write_rgbd(path: Path, sample: Sample, *, has_depth: bool = True) -> Path:

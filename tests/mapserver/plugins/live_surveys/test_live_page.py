@@ -13,10 +13,8 @@ from rich.console import Console
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from fleetmap.sensors.samples import SensorSet
-from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildOptions
 from mapserver.plugins.live_surveys import live_survey
-from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+from mapserver.plugins.live_surveys.live_survey import run_live
 from mapserver.plugins.live_surveys.message import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving, wait_until
@@ -95,8 +93,6 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
 
 # A survey that loses itself: another part, joined by sure revisits alone, on the way and in the draft.
 
-SETTINGS = survey_settings(None, SensorSet.STEREO)
-
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -107,11 +103,10 @@ class Drive:
     """A kidnapped survey as `mapserver live` follows and builds it, mapped in this process."""
 
     def __init__(self, recording: Path, frames: str, store: Path) -> None:
-        options = BuildOptions(use=SensorSet.STEREO)
-        with pytest.MonkeyPatch.context() as patch, played(recording, frames, 0, SensorSet.STEREO) as drive:
+        playing = played(recording, store / "maps", frames, 0, SensorSet.STEREO)
+        with pytest.MonkeyPatch.context() as patch, playing as drive:
             patch.setattr(live_survey, "MappingProcess", MappingHere)
-            request = LiveRequest("lab", store / "maps", SETTINGS, options)
-            _, built = run_live(request, drive, self._hear, lambda: False, Console(quiet=True))
+            _, built = run_live(drive, [self._hear], lambda: False, Console(quiet=True))
         (self.survey,) = (surveyed.survey for surveyed in built.built.surveyed)
         self.trajectory, self.mapping = built.trajectory, MappingHere.made
 

@@ -17,10 +17,11 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
 from mapserver.cli import app
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildRequest
 from mapserver.plugins.live_surveys import command as live_command
 from mapserver.plugins.live_surveys import drives
-from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
-from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+from mapserver.plugins.live_surveys.drives import SensorDrive
+from mapserver.plugins.live_surveys.live_survey import run_live
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import Call, MappingHere, laid_on_truth, order_builds, write_rgbd
@@ -96,11 +97,11 @@ def test_live_and_build_take_one_configuration_file(
     assert by_live.use is kind
 
 
-def driven(site: Site, drive: RecordedDrive | SensorDrive, kind: SensorSet) -> list[LiveSurveyState]:
+def drive(site: Site, record: Path, sensors: "Scripted", names: Topics) -> list[LiveSurveyState]:
     told: list[LiveSurveyState] = []
-    request = LiveRequest("lab", site.store, survey_settings(None, kind))
     try:
-        run_live(request, drive, told.append, lambda: False, QUIET)
+        sensor_drive = SensorDrive(BuildRequest((record,), "lab", site.store), sensors, names)
+        run_live(sensor_drive, [told.append], lambda: False, QUIET)
     except FleetmapError:
         assert told[-1].phase == "failed"
         raise
@@ -160,13 +161,12 @@ def test_sensors_that_say_nothing_are_not_waited_for(
     monkeypatch.setattr(drives, "_SILENCE_S", 0.2)
     record, sample = tmp_path / "drive.mcap", robot_world.cycle()
     names = Topics(left="/front/left", right="/front/right")
-    drive = SensorDrive(Scripted([]), record, names)
     with pytest.raises(RecordingError, match="expected on /front/left and /front/right"):
-        driven(site, drive, SensorSet.STEREO_INERTIAL)
+        drive(site, record, Scripted([]), names)
     assert not record.exists(), "nothing was recorded"
     frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(3)]
     with pytest.raises(RecordingError, match="no sample of the calibration's IMU"):
-        driven(site, SensorDrive(Scripted(frames), record, names), SensorSet.STEREO_INERTIAL)
+        drive(site, record, Scripted(frames), names)
     with open_recording(record, OpenOptions(topics=names)) as kept:
         assert 1 <= len(kept) <= len(frames)
         np.testing.assert_array_equal(kept.read_frame(0).right, frames[0].right)
@@ -185,9 +185,8 @@ def test_sensors_that_die_end_the_drive_with_their_reason(
 ) -> None:
     record, sample = tmp_path / "drive.mcap", robot_world.cycle()
     frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(count)]
-    drive = SensorDrive(Scripted(frames, error), record, Topics())
     with pytest.raises(RecordingError, match=f"the sensors ended the drive: {says}"):
-        driven(site, drive, SensorSet.STEREO_INERTIAL)
+        drive(site, record, Scripted(frames, error), Topics())
     assert record.exists() == bool(count)
 
 

@@ -21,10 +21,10 @@ from fleetmap.sensors.samples import SensorSet
 from fleetmap.sources.source import RecordingSource
 from mapserver.cli import app
 from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildOptions
+from mapserver.drafting.draft import BuildOptions, BuildRequest
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import SensorDrive
-from mapserver.plugins.live_surveys.live_survey import LiveFigures, LiveRequest, run_live
+from mapserver.plugins.live_surveys.live_survey import LiveFigures, run_live
 from mapserver.plugins.live_surveys.mapping_process import MappingProcess
 from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState, NewKeyframe, packed
 from mapserver.store import MapStore
@@ -48,18 +48,18 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A whole drive at its own speed, all that was told of it, and its store."""
     store, told = tmp_path_factory.mktemp("store") / "maps", list[LiveSurveyState]()
-    with played(recording) as drive:
-        result = run_live(LiveRequest("lab", store, SETTINGS), drive, told.append, lambda: False, QUIET)
+    with played(recording, store) as drive:
+        result = run_live(drive, [told.append], lambda: False, QUIET)
     return result, told, store
 
 
 def test_every_frame_is_tracked_and_every_keyframe_mapped(finished: Finished) -> None:
     (figures, _), told, _ = finished
-    assert (figures.frames, figures.mapping_failed) == (FRAMES, "")
-    assert figures.seconds == pytest.approx((FRAMES - 1) * 0.05)
-    assert 0 < figures.latency_ms[0] <= figures.latency_ms[1]
     last = told[-1]
-    assert len(last.path()) == last.keyframes == figures.keyframes > 2
+    assert (last.frames, figures.mapping_failed) == (FRAMES, "")
+    assert last.seconds == pytest.approx((FRAMES - 1) * 0.05)
+    assert last.latency_ms > 0
+    assert len(last.path()) == last.keyframes == figures.state.keyframes > 2
     assert last.behind == 0
     assert last.estimate.status == "TRACKING"
     assert last.rows("cells")[:, 2].sum() > 100
@@ -94,21 +94,20 @@ def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(
 ) -> None:
     seen: list[LiveSurveyState] = []
     calls = iter(range(FRAMES))
-    with played(recording, speed=0) as drive:
-        request = LiveRequest("lab", tmp_path / "maps", SETTINGS)
-        figures, _ = run_live(request, drive, seen.append, lambda: next(calls) >= 18, QUIET)
-    assert figures.frames == 18
-    assert figures.latency_ms is None
+    with played(recording, tmp_path / "maps", speed=0) as drive:
+        figures, _ = run_live(drive, [seen.append], lambda: next(calls) >= 18, QUIET)
+    assert figures.state.frames == 18
+    assert figures.state.latency_ms is None
     ((path, *_, options),) = ordered
     assert (path, options) == (recording, BuildOptions(frames="0:18:1", settings=SETTINGS))
     assert seen[-1].latency_ms is None
 
 
 def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="100:200"), played(recording, "100:200"):
+    with pytest.raises(UsageError, match="100:200"), played(recording, tmp_path / "maps", "100:200"):
         pass
     for speed in (-1.0, float("nan")):
-        with pytest.raises(UsageError, match="--speed"), played(recording, speed=speed):
+        with pytest.raises(UsageError, match="--speed"), played(recording, tmp_path / "maps", speed=speed):
             pass
     assert not (tmp_path / "maps").exists()
 
@@ -117,18 +116,18 @@ def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path,
 def test_one_camera_says_that_its_scale_is_not_known_yet(recording: Path, tmp_path: Path) -> None:
     """The camera of this recording only turns: it sees no depth, so that nothing can be mapped."""
     told: list[LiveSurveyState] = []
-    with played(recording, speed=0, use=SensorSet.MONO_INERTIAL) as drive:
-        settings = survey_settings(None, SensorSet.MONO_INERTIAL)
-        run_live(LiveRequest("lab", tmp_path / "maps", settings), drive, told.append, lambda: False, QUIET)
+    with played(recording, tmp_path / "maps", speed=0, use=SensorSet.MONO_INERTIAL) as drive:
+        run_live(drive, [told.append], lambda: False, QUIET)
     assert {(state.scale_known, state.keyframes) for state in told[1:]} == {(False, 0)}
 
 
 def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: Path, ordered: list[Call]) -> None:
     """A recording takes the place of the sensors: what comes out must hold all that went in."""
     source = RecordingSource(open_recording(recording), speed=0)
-    drive = SensorDrive(source, tmp_path / "drive.mcap", Topics())
-    figures, _ = run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS), drive, lambda _: None, lambda: False, QUIET)
-    assert (figures.frames, figures.dropped) == (FRAMES, 0)
+    request = BuildRequest((tmp_path / "drive.mcap",), "lab", tmp_path / "maps")
+    drive = SensorDrive(request, source, Topics())
+    figures, _ = run_live(drive, [], lambda: False, QUIET)
+    assert (figures.state.frames, figures.dropped) == (FRAMES, 0)
     with open_recording(recording) as given, open_recording(tmp_path / "drive.mcap") as kept:
         assert kept.frame_stamps_ns.tolist() == given.frame_stamps_ns.tolist()
         np.testing.assert_array_equal(kept.read_frame(5).left, given.read_frame(5).left)
@@ -138,7 +137,7 @@ def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: P
     ((path, *_, options),) = ordered
     assert (path, options) == (tmp_path / "drive.mcap", BuildOptions(settings=SETTINGS))
     with pytest.raises(UsageError, match="--record"):
-        SensorDrive(source, tmp_path / "drive.mcap", Topics())
+        SensorDrive(request, source, Topics())
 
 
 def test_what_a_killed_survey_has_recorded_can_be_read(recording: Path, tmp_path: Path) -> None:
