@@ -23,6 +23,7 @@ from fleetmap.geometry import (
 )
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings import Recording
+from fleetmap.recordings.ordering import nearest
 from fleetmap.recordings.tum import format_stamp
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
@@ -85,12 +86,9 @@ class GivenTrajectory:
             )
         written, camera = read_poses(self.file), recording.calibration.cameras[0]
         check_depths(file, len(written.map_from_it), camera)
-        # The frame at each stamp, -1 if absent
-        stamps, frame_stamps_ns = stamps_on_clock(written, recording, indices, self), recording.frame_stamps_ns
-        after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
-        frame_of_row = np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
+        stamps = stamps_on_clock(written, recording, indices, self)
+        frames = nearest(recording.frame_stamps_ns, stamps)
+        frame_of_row = np.where(np.abs(recording.frame_stamps_ns[frames] - stamps) > NEAR_NS, -1, frames)
         if (frame_of_row >= 0).mean() <= 0.5:
             raise RecordingError(
                 f"{self.file} belongs to another recording: most of its stamps match no frame; pass the recording's own"
@@ -134,11 +132,11 @@ class GivenTrajectory:
         is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
         whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
         followed = _followed(recording, indices, whole=whole)
-        shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
-        found, words = _judged(other_trajectory, f"{self.file.name} ({written.kind})", shown, recording, self)
+        found, words = _judged(other_trajectory, followed, stretches(followed, known), recording, self)
+        words = f"trajectory {self.file.name} ({written.kind}): {words}"
         at_frames = np.array([np.eye(4) if each is None else each for each in map_from_it])
         at_frames[:, :3, 3] *= found.in_metres
-        at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
+        at_frames = at_frames @ se3_inverse(followed.body_from(found.reading))
         if not known.all():
             if not whole:
                 followed = _followed(recording, indices, whole=True)
@@ -171,20 +169,12 @@ class PoseReading:
 @dataclass(frozen=True)
 class OwnMotion:
     """Motion of the recording: stamps_ns (F,), frame_from_body (F, 4, 4), and the number of the connected piece (F,) of each frame,
-    -1 if lost.
+    -1 if lost; and the mount of the camera.
     """
 
     stamps_ns: Stamps
     frame_from_body: Array
     piece: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Reference:
-    """Reference for readings: the motion, its stretches (P, 2), and the mount of the camera."""
-
-    followed: OwnMotion
-    pairs: NDArray[np.int64]
     body_from_cam: Array
 
     def body_from(self, reading: PoseReading) -> Array:
@@ -259,13 +249,14 @@ def stretches(followed: OwnMotion, known: NDArray[np.bool_]) -> NDArray[np.int64
     return np.array(found, np.int64).reshape(-1, 2)
 
 
-def judge(as_read: Trajectory, reading: PoseReading, shown: Reference, scale: float | None) -> Judgement:
-    """Judge the reading with poses `as_read`, over stretches; scale: metres in the unit of length if known."""
-    followed, pairs = shown.followed, shown.pairs
+def judge(
+    as_read: Trajectory, reading: PoseReading, followed: OwnMotion, pairs: NDArray[np.int64], scale: float | None
+) -> Judgement:
+    """Judge the reading with poses `as_read`, over stretches (P, 2); scale: metres in the unit of length if known."""
     ends: Array = np.array([pose_at(as_read, int(stamp)) for stamp in followed.stamps_ns[pairs.ravel()]], np.float64)
     ends = ends.reshape(-1, 2, 4, 4)
     moved = se3_inverse(ends[:, 0]) @ ends[:, 1]
-    seen_ends = followed.frame_from_body[pairs] @ shown.body_from(reading)
+    seen_ends = followed.frame_from_body[pairs] @ followed.body_from(reading)
     seen = se3_inverse(seen_ends[:, 0]) @ seen_ends[:, 1]
     turns, seen_turns = _angles(moved[:, :3, :3]), _angles(seen[:, :3, :3])
     ways, seen_ways = (np.linalg.norm(motion[:, :3, 3], axis=1) for motion in (moved, seen))
@@ -388,24 +379,24 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
             pieces += is_lost or number == first  # without an IMU the next frames are not connected to the earlier ones
             piece[number] = pieces
         frame_from_body[first:end] = run.chain.odom_from_body()
-    return OwnMotion(recording.frame_stamps_ns[indices], frame_from_body, piece)
+    return OwnMotion(recording.frame_stamps_ns[indices], frame_from_body, piece, rig.cameras[0].body_from_cam)
 
 
 def _judged(
-    trajectory: Trajectory, name: str, shown: Reference, recording: Recording, other: GivenTrajectory
+    trajectory: Trajectory, followed: OwnMotion, pairs: NDArray[np.int64], recording: Recording, other: GivenTrajectory
 ) -> tuple[Judgement, str]:
     """Return the poses in the named convention, and text on how well they fit.
 
     RecordingError if another convention fits better, with what to do, or none fits; UsageError if the scale is unknown.
     """
-    is_camera_body = bool(np.abs(shown.body_from_cam - np.eye(4)).max() < 1e-3)
+    is_camera_body = bool(np.abs(followed.body_from_cam - np.eye(4)).max() < 1e-3)
     # A camera that is the body has one frame.
     conventions = [PoseReading(*each) for each in product(FRAMES[is_camera_body:], (False, True), (False, True))]
-    every = [judge(read_as(trajectory, each), each, shown, other.scale) for each in conventions]
+    every = [judge(read_as(trajectory, each), each, followed, pairs, other.scale) for each in conventions]
     best = min(every, key=lambda judged: float(judged.errors.mean()) if len(judged.errors) else 0.0)
     said = PoseReading(FRAMES[1] if is_camera_body else other.frame)
     (found,) = [each for each in every if each.reading == said]
-    count = len(shown.pairs)
+    count = len(pairs)
     if not best.fits:
         raise RecordingError(
             f"{other.file} belongs to another recording: read as {best.reading}, which fits {recording.name} best, it is off by "
@@ -420,7 +411,7 @@ def _judged(
         raise UsageError(
             f"{recording.name} does not show the unit of {other.file}; set its metres with --trajectory-scale METRES"
         )
-    words = f"trajectory {name}: {said}, scale {found.in_metres:.4g}"
+    words = f"{said}, scale {found.in_metres:.4g}"
     if found.turn_error is None and found.way_error is None:
         return found, f"{words}, as stated; the recording moves too little to judge it"
     return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
