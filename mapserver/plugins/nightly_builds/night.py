@@ -7,7 +7,7 @@ recordings already in a version are only moved.
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil
@@ -238,14 +238,13 @@ class _Night:
                     groups += [[r] for r in group]
                     continue
                 words = f"{type(error).__name__}: {str(error)[:200]}; a bug; report it with the log"
-                self._put_all_away(group, {group[0].path: words}, words)
+                self._put_aside(group, {group[0].path: words}, {})
                 failed = RecordingError(f"{group[0].path}: {words}")
         if failed is not None and len(self._report.published) == published:
             raise failed
 
     def _build(self, recordings: list[InboxRecording]) -> None:
         request = self._request
-        by_hash = {recorded.sha256: recorded for recorded in recordings}
         unusable: dict[Path, str] = {}
         current = _current(self._maps, request.site)
         entries = () if current is None else self._maps.manifest(request.site, current).recordings
@@ -261,23 +260,23 @@ class _Night:
         try:
             draft, _ = build_draft(build, settings_for(build), unusable)
         except (RecordingError, SurveyError) as error:
-            self._put_all_away(recordings, unusable, str(error))
+            self._put_aside(recordings, unusable, dict.fromkeys((r.sha256 for r in recordings), str(error)))
             raise
         self._look_at([])
         self._report.builds.append({"version": draft.version, **draft.report})
         self._say(draft.sentence)
-        for sha256, reason in draft.left_out.items():
-            recorded = by_hash.pop(sha256)
-            self._put_away(recorded.path, boxes.HELD, sha256, recorded.why(reason))
-        for recorded in [r for r in by_hash.values() if r.path in unusable]:
-            self._put_away(recorded.path, boxes.BAD, recorded.sha256, recorded.why(unusable[recorded.path]))
-        rest = [recorded for recorded in by_hash.values() if recorded.path not in unusable]
-        self._publish(self._maps.version(request.site, draft.version), rest)
+        self._put_aside(recordings, {}, draft.left_out)
+        self._put_aside(recordings, unusable, {})
+        self._publish(self._maps.version(request.site, draft.version), recordings)
 
-    def _put_all_away(self, recordings: list[InboxRecording], unusable: dict[Path, str], reason: str) -> None:
+    def _put_aside(
+        self, recordings: list[InboxRecording], unusable: dict[Path, str], left_out: Mapping[str, str]
+    ) -> None:
+        """Put away those that are in no draft, by the reasons: unusable ones by path, valid ones by hash."""
         for recorded in recordings:
-            where = boxes.BAD if recorded.path in unusable else boxes.HELD
-            self._put_away(recorded.path, where, recorded.sha256, recorded.why(unusable.get(recorded.path, reason)))
+            if (reason := unusable.get(recorded.path, left_out.get(recorded.sha256))) is not None:
+                where = boxes.BAD if recorded.path in unusable else boxes.HELD
+                self._put_away(recorded.path, where, recorded.sha256, recorded.why(reason))
 
     def _publish(self, draft: VersionInfo, recordings: list[InboxRecording]) -> None:
         """Take a draft through the gate and move its recordings; of several in a refused one each must be tried alone."""
