@@ -81,7 +81,15 @@ class BackupTarget:
             )
         if (size := self._objects.size(path := f"{_SNAPSHOTS}/{name}.json") or 0) > _MOST_BYTES:
             raise MapFormatError(f"snapshot {name} has {size} bytes, the limit is {_MOST_BYTES}")
-        return name, _decoded(name, b"".join(self._objects.chunks(path)))
+        refusal = f"snapshot {name} is damaged ({{}}); take an earlier one with --snapshot"
+        found = decode_json(b"".join(self._objects.chunks(path)), Snapshot, refusal)
+        if found.format > FORMAT:
+            raise NewerFormatError(
+                f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it"
+            )
+        if unknown := [path for path in found.files if not NAMED.fullmatch(path)]:
+            raise MapFormatError(f"snapshot {name} names the file {unknown[0][:200]!r}, which no store has")
+        return name, found
 
     def write(self, snapshot: Snapshot, now: datetime) -> str:
         """Write a snapshot, whose objects are there, and return its name: the time, but later than all others, whatever the clock says."""
@@ -131,12 +139,3 @@ class BackupTarget:
 
     def _names(self, prefix: str) -> list[str]:
         return [path.rpartition("/")[2].removesuffix(".json") for path, _, _ in self._objects.listed(prefix)]
-
-
-def _decoded(name: str, data: bytes) -> Snapshot:
-    found = decode_json(data, Snapshot, f"snapshot {name} is damaged ({{}}); take an earlier one with --snapshot")
-    if found.format > FORMAT:
-        raise NewerFormatError(f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it")
-    if unknown := [path for path in found.files if not NAMED.fullmatch(path)]:
-        raise MapFormatError(f"snapshot {name} names the file {unknown[0][:200]!r}, which no store has")
-    return found
