@@ -106,16 +106,16 @@ def set_alignment(
     if bool(data) != (plan is not None):
         raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
     drawing = None if plan is None else decode_plan(plan, data)
-    found, _ = building.align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
-    return dict(to_plain(found))
+    fit = building.align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
+    return dict(to_plain(fit.alignment))
 
 
 @router.get("/v1/sites/{site}/alignment/estimate")
 def estimate_alignment(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
     """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
     store.current(site)
-    found, fit = building.estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
-    return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
+    fit = building.estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
+    return dict(to_plain(fit.alignment)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
 
 
 @router.delete("/v1/sites/{site}/alignment")

@@ -69,7 +69,7 @@ def align(
             return
         if named:
             pins, drawing = [parse_pin(text) for text in pin or []], None if plan is None else read_plan(plan)
-            _, fit = building.align(maps, where.site, pins, drawing, metres_per_pixel, by.named())
+            fit = building.align(maps, where.site, pins, drawing, metres_per_pixel, by.named())
             if not fit.is_checked:
                 words = "the pins lie on one line and cannot reveal a mirrored plan; add a pin beside the line"
                 typer.echo(f"note: {words}", err=True)

@@ -128,31 +128,23 @@ def _is_same(before: Area, after: Area) -> bool:
 
 def estimate_alignment(
     store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None
-) -> tuple[Alignment, Fit]:
+) -> Fit:
     """Return the pose of a site's map in the drawing of its building (None: of pins alone), from pins.
 
     metres_per_pixel: of the drawing, None to estimate it. StateError without a current version, UsageError for pins that give no pose.
     """
     drawn = upwards(list(pins)) if plan is None else plan.drawn(list(pins))
-    fit = fit_pins(drawn, metres_per_pixel, current_corners_m(store, site))
-    found = Alignment(
-        frame=fit.frame,
-        metres_per_unit=fit.metres_per_unit,
-        method="pins",
-        plan=None if plan is None else plan.name,
-        off_m=fit.off_m,
-    )
-    return found, fit
+    return fit_pins(drawn, metres_per_pixel, current_corners_m(store, site), None if plan is None else plan.name)
 
 
 def align(
     store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None, actor: Actor
-) -> tuple[Alignment, Fit]:
+) -> Fit:
     """As `estimate_alignment`, and keep it with the drawing."""
-    found, fit = estimate_alignment(store, site, pins, plan, metres_per_pixel)
-    files = {ALIGNMENT: encode_alignment(found), PLAN: None if plan is None else plan.data}
-    store.keep_site_files(site, files, alignment_words(found), actor=actor)
-    return found, fit
+    fit = estimate_alignment(store, site, pins, plan, metres_per_pixel)
+    files = {ALIGNMENT: encode_alignment(fit.alignment), PLAN: None if plan is None else plan.data}
+    store.keep_site_files(site, files, alignment_words(fit.alignment), actor=actor)
+    return fit
 
 
 def forget_alignment(store: MapStore, site: str, actor: Actor) -> None:

@@ -16,6 +16,7 @@ from fleetmap.errors import InvalidValueError
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
+from mapserver.floor_plan.alignment import Alignment
 
 PIN_SIGMA_M = 0.03  # of click and map point together, each axis; larger if the pins' residuals are
 MAX_PINS = 100
@@ -38,14 +39,10 @@ class Pin:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The map's pose. off_m: residual at each pin; far_sigma_m: standard deviation at the map's furthest corner.
+    """The map's pose. far_sigma_m: standard deviation at the map's furthest corner; is_checked: True if the pins could reveal a mirrored
+    drawing or a wrong pin."""
 
-    is_checked: True if the pins could reveal a mirrored drawing or a wrong pin.
-    """
-
-    frame: BuildingFrame
-    metres_per_unit: float
-    off_m: dict[str, float]
+    alignment: Alignment
     far_sigma_m: float
     is_checked: bool
 
@@ -61,11 +58,11 @@ def parse_pin(text: str) -> Pin:
     return Pin(match[1].strip(), (px, py), (mx, my))
 
 
-def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array) -> Fit:
+def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array, plan: str | None = None) -> Fit:
     """Fit a rotation, a shift and, without metres_per_unit, a scale by least squares. Source: Umeyama 1991, in the plane.
 
-    map_corners_m: (N, 2) extent of the map. InvalidValueError for too few, too close or contradictory pins, naming
-    the wrong one if possible, and for a mirrored drawing.
+    map_corners_m: (N, 2) extent of the map. plan: the drawing's name. InvalidValueError for too few, too close or contradictory pins,
+    naming the wrong one if possible, and for a mirrored drawing.
     """
     if not 2 <= len(pins) <= MAX_PINS:
         raise InvalidValueError(f"{len(pins)} pins: give 2 to {MAX_PINS}, three or four in the corners of the hall")
@@ -104,7 +101,8 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
         sigma_rad=float(np.sqrt(cov[2, 2])),
     )
     left = {pin.name: float(off) for pin, off in zip(pins, off_m, strict=True)}
-    return Fit(frame, scale, left, far_sigma_m, _spread_m(points) >= _LEAST_APART_M)
+    found = Alignment(frame=frame, metres_per_unit=scale, method="pins", plan=plan, off_m=left)
+    return Fit(found, far_sigma_m, _spread_m(points) >= _LEAST_APART_M)
 
 
 def similarity(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> tuple[complex, complex]:

@@ -26,18 +26,18 @@ def pins_at(points_map: np.ndarray, clicked_m: np.ndarray | float = 0.0, *, mirr
 
 def errors(fit: Fit, metres_per_px: float) -> tuple[float, float]:
     """Metres at the worst corner of the hall, and degrees. metres_per_px: what the fit's metres are turned into pixels by."""
-    homogeneous = np.c_[HALL, np.zeros(4), np.ones(4)] @ fit.frame.building_from_map.T
+    homogeneous = np.c_[HALL, np.zeros(4), np.ones(4)] @ fit.alignment.frame.building_from_map.T
     on_plan_m = homogeneous[:, :2] * METRES_PER_PX / metres_per_px
-    turn_deg = np.degrees(abs(fit.frame.yaw_rad - TURN))
+    turn_deg = np.degrees(abs(fit.alignment.frame.yaw_rad - TURN))
     return float(np.linalg.norm(on_plan_m - building(HALL), axis=1).max()), float(turn_deg)
 
 
 def test_exact_pins_give_the_exact_frame() -> None:
     fit = fit_pins(pins_at(HALL[:3]), None, HALL)
     assert errors(fit, METRES_PER_PX) < (1e-9, 1e-9)
-    assert fit.metres_per_unit == pytest.approx(METRES_PER_PX)
+    assert fit.alignment.metres_per_unit == pytest.approx(METRES_PER_PX)
     assert fit.is_checked
-    assert max(fit.off_m.values()) < 1e-9
+    assert max(fit.alignment.off_m.values()) < 1e-9
 
 
 @pytest.mark.parametrize("metres_per_px", [None, METRES_PER_PX])
@@ -48,7 +48,7 @@ def test_three_pins_clicked_with_3_cm_error(metres_per_px: float | None) -> None
         angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
         clicked = 0.03 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         fit = fit_pins(pins_at(HALL[:3], clicked), metres_per_px, HALL)
-        found.append(errors(fit, fit.metres_per_unit))  # on the plan, where people look
+        found.append(errors(fit, fit.alignment.metres_per_unit))  # on the plan, where people look
         covered.append(errors(fit, METRES_PER_PX)[0] < 2.5 * fit.far_sigma_m)
     worst_m, worst_deg = np.max(found, axis=0)
     assert (np.percentile([m for m, _ in found], 90), worst_m) < (0.05, 0.06)
