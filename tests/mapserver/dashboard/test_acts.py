@@ -412,3 +412,4 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
             store.operators.set_role("bob", "viewer", Actor("root"))
         opened(page, served, "administration/people", site=SITE)
         expect(page.get_by_role("alert")).to_have_text("bob (viewer) may not open this page; an admin may.")
+        seen.refused(403)

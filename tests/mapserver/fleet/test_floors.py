@@ -181,9 +181,9 @@ def test_a_lift_without_an_outline_is_refused(ring: str) -> None:
 
 def hotel(folder: Path, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
     """The file of Open-RMF's hotel, with a change."""
-    content = yaml.safe_load((real_data("rmf") / "hotel.building.yaml").read_text())
+    content = yaml.load((real_data("rmf") / "hotel.building.yaml").read_text(), yaml.CSafeLoader)
     change(content)
-    (folder / "hotel.building.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "hotel.building.yaml").write_text(yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False))
     return folder / "hotel.building.yaml"
 
 
@@ -207,7 +207,7 @@ def test_a_building_of_open_rmf_comes_with_its_lifts_and_is_written_again(
     written = run(app, "building", "list", "--as", "rmf", *in_store)
     content = yaml.safe_load(written)
     assert content["levels"] == {"L1": {"elevation": 0.0}, "L3": {"elevation": 16.0}}
-    vertices = yaml.safe_load(file.read_text())["levels"]["L1"]["vertices"]
+    vertices = yaml.load(file.read_text(), yaml.CSafeLoader)["levels"]["L1"]["vertices"]
     metres_per_px = 3.4 / np.hypot(*np.subtract(vertices[54][:2], vertices[53][:2]))  # its measurement
     for name, x_px, y_px in (("Lift1", 355, 340), ("Lift2", 305, 435)):
         lift = content["lifts"][name]

@@ -300,7 +300,7 @@ def follow(robot: Path, root: bytes, store: MapStore) -> SignedLists:
     return lists
 
 
-def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match="holds no backups"):
         BackupTarget(str(tmp_path / "nothing"))
     target = BackupTarget(str(tmp_path / "backups"), create=True)
@@ -313,9 +313,9 @@ def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, monkeypatc
         restore(target, store.folder, ADA)
     with pytest.raises(UsageError, match="without --recipient"):
         restore(target, tmp_path / "new", ADA, identities=[pyrage.x25519.Identity.generate()])
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
     with pytest.raises(StoreError, match="credentials"):
-        BackupTarget("s3://nowhere/a").snapshots()
+        BackupTarget(f"{s3}-backups").snapshots()
     with pytest.raises(StoreError, match="credentials"):
         BackupTarget("nonsense://nowhere/a")
 
