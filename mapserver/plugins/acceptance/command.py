@@ -1,7 +1,7 @@
 """`mapserver accept`: the acceptance report of a site."""
 
-import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from mapserver.plugins.acceptance.document import SitePlan
     from mapserver.plugins.acceptance.figures import Report
-    from mapserver.store import MapStore
 
 EXIT_STATUS_NOT_ACCEPTED = 1
 
@@ -58,17 +57,19 @@ def accept(
     The first line is the verdict. Status 1 if the site is not accepted.
     """
     from fleetmap.encoding import to_json
+    from mapserver.drafting.survey_recordings import RecordingOptions
     from mapserver.plugins.acceptance.document import html_page
-    from mapserver.plugins.acceptance.verdict import compared
+    from mapserver.plugins.acceptance.examine import examine
+    from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared
     from mapserver.trust.signing import sign_files
 
     if not options.out.is_dir():
         raise UsageError(f"--out {options.out}: the folder does not exist; make it first")
+    reading = RecordingOptions(options.frames, options.calibration, topics_of(context, options.topic))
+    promises = [words for words, given in ((ONE_WAY, options.one_way), (KNOWN_STARTS, options.known_starts)) if given]
     with open_store(options.store, read_only=True) as maps:
-
-        def report_of(version: int) -> "tuple[Report, SitePlan]":
-            return _report(context, maps, version, recordings, options)
-
+        driven = partial(examine, maps, options.site, recordings=recordings, reading=reading)
+        report_of = partial(driven, promises=promises, config=settings_of(context))
         before = None if options.before is None else _before(options.before, options.site, report_of)
         report, plan = report_of(version_named(maps, options.site, options.version))
         if before is not None:
@@ -93,27 +94,6 @@ def accept(
         )
     if not report.is_accepted:
         raise typer.Exit(EXIT_STATUS_NOT_ACCEPTED)
-
-
-def _report(
-    context: typer.Context, maps: "MapStore", version: int, recordings: list[Path], options: AcceptOptions
-) -> "tuple[Report, SitePlan]":
-    from fleetmap.recordings import OpenOptions
-    from mapserver.fleet.resurvey_list import resurvey_list
-    from mapserver.plugins.acceptance.drives import DriveRequest
-    from mapserver.plugins.acceptance.examine import PICTURES, STARTS, examine
-    from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, judged
-
-    opening, settings = OpenOptions(options.calibration, topics_of(context, options.topic)), settings_of(context)
-    starts, pictures = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
-    drives = [DriveRequest(path, options.frames, opening, starts, pictures) for path in recordings]
-    promises = [words for words, given in ((ONE_WAY, options.one_way), (KNOWN_STARTS, options.known_starts)) if given]
-    report, plan = examine(maps, options.site, version, drives, promises)
-    fleet = [
-        f"{c.name}: {'; '.join(c.reasons)}"
-        for c in resurvey_list(maps, options.site, settings.resurvey, time.time_ns()).tiles
-    ]
-    return judged(report, settings.gate, maps.evidence(options.site, version), fleet), plan
 
 
 def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, SitePlan]]") -> "Report":

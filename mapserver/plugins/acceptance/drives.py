@@ -1,9 +1,11 @@
 """A drive through a site: replayed by the robots' program, and its pictures localized in the version's tiles."""
 
 import subprocess
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -19,7 +21,8 @@ from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
 from fleetmap.mapformat.tile_codec import decode_tile
-from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.messages import Status
+from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.recordings.tum import read_tum
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
@@ -27,6 +30,7 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
 from mapserver.doctor import Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
+from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.fleet.bounded_process import client_command
 from mapserver.plugins.acceptance.figures import QUANTILES, DriveFigures, quantile
 from mapserver.plugins.acceptance.ladders import ladders
@@ -35,7 +39,6 @@ from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 
 _NEVER_LOCALISED = 6  # exit status of `locclient replay` that comes with a report
-_TRACKING, _AMBIGUOUS = "TRACKING", "AMBIGUOUS"  # fleetmap.messages.Status, as the report writes them
 # Of a place that can judge an estimate of centimetres: a dock or tag, not a zone or an operator's click
 _DOCK_SIGMA_M = 0.1
 
@@ -59,14 +62,12 @@ class ReplayReport(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class MapUnderTest:
-    """A version of a site. built: what its archive knows, None for a version without one. truth_in_map: True if its frame is that of the
-    recordings' ground truth."""
+    """A version of a site. built: what its archive knows, None for a version without one."""
 
     store: Path
     manifest: Manifest
     view: MapView
     built: Before | None
-    truth_in_map: bool
 
     @classmethod
     def of(cls, maps: MapStore, site: str, version: int) -> "MapUnderTest":
@@ -75,19 +76,7 @@ class MapUnderTest:
         tiles = (decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles)
         view = MapView(tiles, decode_vocabulary(maps.blob(manifest.vocabulary.sha256)), manifest.camera.focal_px)
         built = None if archive is None else Before.of(maps, manifest, decode_archive(archive))
-        truth_in_map = bool(manifest.configuration.get("frame_from_ground_truth"))
-        return cls(maps.folder, manifest, view, built, truth_in_map)
-
-
-@dataclass(frozen=True)
-class DriveRequest:
-    """A recording, its selected frames, and how many starts and pictures of it are wanted."""
-
-    path: Path
-    frames: str
-    opening: OpenOptions
-    starts: int
-    pictures: int
+        return cls(maps.folder, manifest, view, built)
 
 
 class Start(NamedTuple):
@@ -123,50 +112,50 @@ class Drive:
     places_m: Array
 
 
-class Reference(NamedTuple):
-    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map."""
-
-    source: str
-    trajectory: Trajectory
-    free: NDArray[np.bool_]
-
-
-def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport, Trajectory]:
-    """Replay a drive, and its starts, by `locclient replay` in a process of its own; return its report and the localized frames."""
+def replayed(
+    path: Path, reading: RecordingOptions, starts: int, version: MapUnderTest
+) -> tuple[ReplayReport, Trajectory]:
+    """Replay a drive, and so many starts, by `locclient replay` in a process of its own; return its report and the localized frames."""
     with TemporaryDirectory() as folder:
         report, trajectory = Path(folder) / "report.json", Path(folder) / "trajectory.tum"
         named = {
-            "--store": version.store, "--site": version.manifest.site, "--version": version.manifest.version, "--frames": request.frames,
-            "--cache": folder, "--report": report, "--trajectory": trajectory, "--starts": request.starts,
+            "--store": version.store, "--site": version.manifest.site, "--version": version.manifest.version, "--frames": reading.frames,
+            "--cache": folder, "--report": report, "--trajectory": trajectory, "--starts": starts,
+            "--calibration": reading.calibration,
         }  # fmt: skip
-        if request.opening.calibration_file is not None:
-            named["--calibration"] = request.opening.calibration_file
-        command = client_command("replay", request.path, *(word for option in named.items() for word in option))
+        given = [word for option in named.items() if option[1] is not None for word in option]
+        command = client_command("replay", path, *given)
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
         if done.returncode not in (0, _NEVER_LOCALISED):
-            raise FleetmapError((done.stderr.strip().splitlines() or [f"replay of {request.path} failed"])[-1])
+            raise FleetmapError((done.stderr.strip().splitlines() or [f"replay of {path} failed"])[-1])
         return msgspec.json.decode(report.read_bytes(), type=ReplayReport), read_tum(trajectory)
 
 
-def examined(request: DriveRequest, version: MapUnderTest, replay: Future[tuple[ReplayReport, Trajectory]]) -> Drive:
-    """Return the figures of a drive, which the doctor checks while it is replayed; errors as of the recording and the replay."""
-    with open_recording(request.path, request.opening) as opened:
+def examined(
+    path: Path,
+    reading: RecordingOptions,
+    pictures: int,
+    version: MapUnderTest,
+    replay: Future[tuple[ReplayReport, Trajectory]],
+) -> Drive:
+    """Return a drive with so many pictures, which the doctor checks while it is replayed; errors as of the recording and the replay."""
+    with open_recording(path, reading.opening) as opened:
         findings = run_checks(opened).findings
         report, localised = replay.result()
-        recording, selected = opened.readable(FrameSelection.parse(request.frames).apply(opened))
-        reference = _reference(recording, selected, version, localised)
-        truths = [reference.trajectory.at(int(stamp)) for stamp in recording.frame_stamps_ns[selected]]
+        recording, selected = opened.readable(FrameSelection.parse(reading.frames).apply(opened))
+        source, reference, is_free = _reference(recording, selected, version, localised)
+        truths = [reference.at(int(stamp)) for stamp in recording.frame_stamps_ns[selected]]
         known = np.array([truth is not None for truth in truths], bool)
-        numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
-        pictures = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
-        starts = [_start(frames, reference.trajectory) for frames in report.starts]
+        numbers = spread(np.flatnonzero(known & is_free), pictures)
+        looked = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
+        starts = [_start(frames, reference) for frames in report.starts]
         off = {
             stamp: _off(map_from_body, truth)
             for stamp, map_from_body in zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
-            if (truth := reference.trajectory.at(stamp)) is not None
+            if (truth := reference.at(stamp)) is not None
         }
         errors_mm = None
-        if off and reference.trajectory is not localised:
+        if off and reference is not localised:
             all_mm = [round(1e3 * error_m, 2) for error_m, _ in off.values()]
             errors_mm = {name: quantile(all_mm, share) for name, share in QUANTILES.items()} | {"max": max(all_mm)}
         docks_mm = [
@@ -183,7 +172,7 @@ def examined(request: DriveRequest, version: MapUnderTest, replay: Future[tuple[
             day=day if day > "2000" else None,
             frames=report.frames,
             hours=round(float(stamps_ns[-1] - stamps_ns[0]) / 3.6e12, 6),
-            reference=reference.source,
+            reference=source,
             is_surveyed=any(recording.content_hash() == each.sha256 for each in version.manifest.recordings),
             localised_share=round(report.localised_share_of_all or 0.0, 4),
             failures=report.position_failures,
@@ -194,22 +183,23 @@ def examined(request: DriveRequest, version: MapUnderTest, replay: Future[tuple[
             remarks=[f"{f.name}: {f.sentence}" for f in findings if f.verdict in (Verdict.WARN, Verdict.FAIL)],
         )
     places = np.array([truth[:2, 3] for truth in truths if truth is not None]).reshape(-1, 2)
-    return Drive(figures, starts, pictures, places)
+    return Drive(figures, starts, looked, places)
 
 
 def _reference(
     recording: Recording, selected: NDArray[np.int64], version: MapUnderTest, localised: Trajectory
-) -> Reference:
-    """Return the best known poses: ground truth in the map's frame, the version's own survey, or the localized frames themselves."""
+) -> tuple[str, Trajectory, NDArray[np.bool_]]:
+    """Return the best known poses with the name of their source: ground truth in the map's frame, the version's own survey, or the
+    localized frames themselves; and the mask (F,) of selected frames that did not make the map."""
     entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
     known = None if version.built is None else version.built.trajectory_of(entry)
     source, trajectory = "its own replay", localised
-    if version.truth_in_map and recording.ground_truth is not None:
+    if version.manifest.configuration.get("frame_from_ground_truth") and recording.ground_truth is not None:
         source, trajectory = "ground truth", recording.ground_truth
     elif known is not None:
         source = f"the survey of version {version.manifest.version}"
         trajectory = Trajectory(recording.frame_stamps_ns[selected], known[0])
-    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1])
+    return source, trajectory, np.ones(len(selected), bool) if known is None else known[1]
 
 
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
@@ -219,13 +209,8 @@ def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
 
 def _silent_runs(frames: Iterable[tuple[int, bool]]) -> int:
     """Return the number of runs of wrong frames (stamp, is wrong) longer than SILENT_S, or up to the end: those may have become as long."""
-    runs, begun_ns, is_counted = 0, None, False
-    for stamp_ns, is_off in frames:
-        begun_ns = (stamp_ns if begun_ns is None else begun_ns) if is_off else None
-        is_long = begun_ns is not None and stamp_ns - begun_ns > SILENT_S * 1e9
-        runs += is_long and not is_counted
-        is_counted = is_long
-    return runs + (begun_ns is not None and not is_counted)
+    runs = [(is_off, [stamp_ns for stamp_ns, _ in run]) for is_off, run in groupby(frames, itemgetter(1))]
+    return sum(is_off and (ns is runs[-1][1] or ns[-1] - ns[0] > SILENT_S * 1e9) for is_off, ns in runs)
 
 
 def _start(frames: list[StartFrame], reference: Trajectory) -> Start:
@@ -233,13 +218,14 @@ def _start(frames: list[StartFrame], reference: Trajectory) -> Start:
     there = reference.at(frames[0].stamp_ns)
     place_m = np.full(2, np.nan) if there is None else there[:2, 3]
     wrong = [
-        (frame.stamp_ns, frame.status == _TRACKING and is_wrong(*_off(np.array(frame.map_from_body), truth)))
+        (frame.stamp_ns, frame.status == Status.TRACKING and is_wrong(*_off(np.array(frame.map_from_body), truth)))
         for frame in frames
         if frame.map_from_body is not None and (truth := reference.at(frame.stamp_ns)) is not None
     ]
     if _silent_runs(wrong):
         return Start(place_m, "silent")
-    return Start(place_m, {_TRACKING: "found", _AMBIGUOUS: "ambiguous"}.get(frames[-1].status, "lost"))
+    ended = frames[-1].status
+    return Start(place_m, "found" if ended == Status.TRACKING else "ambiguous" if ended == Status.AMBIGUOUS else "lost")
 
 
 def _pictures(recording: Recording, wanted: list[tuple[int, Array | None]], view: MapView) -> Iterator[Picture]:
@@ -262,16 +248,9 @@ def _pictures(recording: Recording, wanted: list[tuple[int, Array | None]], view
             return Picture(probe, float(np.median(frame.left)), None if error is None else error[0], is_off)
 
         found = look(frame)
-        found.rungs.update({kind: _climbed(rungs, look, found) for kind, rungs in ladders(frame, index).items()})
+        for kind, rungs in ladders(frame, index).items():
+            is_fixed = found.is_fixed
+            for level, spoilt in rungs:
+                is_fixed = is_fixed and look(spoilt).is_fixed  # a rung above a missed one counts as missed
+                found.rungs.setdefault(kind, {})[level] = float(np.median(spoilt.left)), is_fixed
         yield found
-
-
-def _climbed(
-    rungs: Iterator[tuple[int, CameraFrame]], look: Callable[[CameraFrame], Picture], start: Picture
-) -> dict[int, tuple[float, bool]]:
-    found, is_fixed = {}, start.is_fixed
-    for level, frame in rungs:
-        seen = look(frame) if is_fixed else None  # a rung above a missed one counts as missed
-        is_fixed = seen is not None and seen.is_fixed
-        found[level] = (float(np.median(frame.left)), is_fixed)
-    return found

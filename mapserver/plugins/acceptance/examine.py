@@ -6,50 +6,63 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.relocalization.map_view import MapView
+from mapserver.config import MapserverConfig
 from mapserver.dashboard.plan import make_plan
 from mapserver.drafting.draft_evidence import PROBES
+from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.drafting.worker import single_threaded_libraries
+from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.kpis import Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
 from mapserver.plugins.acceptance.document import SitePlan
-from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, examined, replayed
+from mapserver.plugins.acceptance.drives import Drive, MapUnderTest, examined, replayed
 from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Report, Similar, StartCounts
 from mapserver.plugins.acceptance.ladders import darkest_grey
+from mapserver.plugins.acceptance.verdict import judged
 from mapserver.quality.directions import headings_of, opposite, tile_directions
 from mapserver.quality.figures import merged
 from mapserver.quality.probes import Probe, aliases, spread
 from mapserver.store import MapStore
 
-STARTS, PICTURES = 40, 80  # of all drives: with 40 starts and none lost, fewer than 8 % of starts are lost
+_STARTS, _PICTURES = 40, 80  # of all drives: with 40 starts and none lost, fewer than 8 % of starts are lost
 _STRIDE_M = 4.0  # from one arrow of the plan to the next
 Where = Callable[[Array], str]
 """Names the area of a place (2,) in `map`."""
 
 
 def examine(
-    maps: MapStore, site: str, version: int, drives: Sequence[DriveRequest], promises: Sequence[str]
+    maps: MapStore,
+    site: str,
+    version: int,
+    *,
+    recordings: Sequence[Path],
+    reading: RecordingOptions,
+    promises: Sequence[str],
+    config: MapserverConfig,
 ) -> tuple[Report, SitePlan]:
-    """Return the figures of a version, without verdict, and its plan. promises: the operator's statements about the robots."""
+    """Return the report of a version, and its plan. promises: the operator's statements about the robots."""
     under_test = MapUnderTest.of(maps, site, version)
     areas = maps.areas(site)
+    starts, pictures = (-(-number // len(recordings)) for number in (_STARTS, _PICTURES))
     where = partial(area_name, areas, under_test.manifest.tile_size_m)
     with single_threaded_libraries(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        replays = [pool.submit(replayed, request, under_test) for request in drives]
-        found = [examined(request, under_test, replay) for request, replay in zip(drives, replays, strict=True)]
-        pictures = [picture for drive in found for picture in drive.pictures]
-        probes = [pictures[n].probe for n in spread(np.arange(len(pictures)), PROBES)]
+        drives = [(path, pool.submit(replayed, path, reading, starts, under_test)) for path in recordings]
+        found = [examined(path, reading, pictures, under_test, replay) for path, replay in drives]
+        looked = [picture for drive in found for picture in drive.pictures]
+        probes = [looked[n].probe for n in spread(np.arange(len(looked)), PROBES)]
         alike = similar(under_test.view, where, probes)
     known = [] if under_test.built is None else under_test.built.calibrations
-    judged = maps.evidence(site, version)
-    built = [] if judged is None else judged.calibrations or []
-    rungs = [rung for picture in pictures for rung in picture.rungs["darkness"].values()]
-    levels = [*((picture.grey, picture.is_fixed) for picture in pictures), *rungs]
+    evidence = maps.evidence(site, version)
+    built = [] if evidence is None else evidence.calibrations or []
+    rungs = [rung for picture in looked for rung in picture.rungs["darkness"].values()]
+    levels = [*((picture.grey, picture.is_fixed) for picture in looked), *rungs]
     counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())
     reported = rate(counts.position_failures, counts.robot_days)
     report = Report(
@@ -68,12 +81,15 @@ def examine(
         fleet=None if reported.low is None else format_rate(reported),
     )
     tried = [start for drive in found for start in drive.starts]
-    starts = {
+    places = {
         name: np.array([start.place_m for start in tried if start.outcome == name])
         for name in StartCounts.__struct_fields__
     }
     seen = make_plan(under_test.manifest, lambda tile: decode_tile(maps.blob(tile.sha256)))
-    return report, SitePlan(seen, areas, starts, drives_to_add(under_test.view, where, report.areas))
+    plan = SitePlan(seen, areas, places, drives_to_add(under_test.view, where, report.areas))
+    again = resurvey_list(maps, site, config.resurvey, maps.now_ns()).tiles
+    fleet = [f"{tile.name}: {'; '.join(tile.reasons)}" for tile in again]
+    return judged(report, config.gate, evidence, fleet), plan
 
 
 def area_name(named: Areas, size_m: float, place_m: Array) -> str:
@@ -90,23 +106,18 @@ def similar(view: MapView, where: Where, probes: Sequence[Probe]) -> list[Simila
     for probe in probes:
         others = {where(fix.map_from_cam[:2, 3]) for fix in aliases(view, probe)}
         pairs.update((where(probe.map_from_cam[:2, 3]), other) for other in others)
-    return sorted(
-        (Similar(*pair, frames) for pair, frames in pairs.items()),
-        key=lambda alike: (-alike.frames, alike.area, alike.other),
-    )
+    return [Similar(*pair, frames) for pair, frames in sorted(pairs.items(), key=lambda found: (-found[1], found[0]))]
 
 
 def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaFigures]:
     """Return the figures of each area with places of the map or of a drive, by name."""
     places: defaultdict[str, list[Array]] = defaultdict(list)
-    figures: dict[str, AreaFigures] = {}
     for place in view.map_from_cam:
         places[where(place[:2, 3])].append(place)
-    squares = {(n, 0): np.array(of_area) for n, of_area in enumerate(places.values())}
-    seen = {found.tile[0]: found for found in tile_directions(squares)}
-    for n, (name, of_area) in enumerate(places.items()):
-        headings = (seen[n].seen, seen[n].missing) if n in seen else ({}, {})
-        figures[name] = AreaFigures(name, len(of_area), *headings)
+    figures = {name: AreaFigures(name, len(of_area)) for name, of_area in places.items()}
+    for ways in tile_directions({(n, 0): np.array(of_area) for n, of_area in enumerate(places.values())}):
+        figures[list(places)[ways.tile[0]]].seen = ways.seen
+        figures[list(places)[ways.tile[0]]].missing = ways.missing
 
     def area(place_m: Array) -> AreaFigures:
         return figures.setdefault(where(place_m), AreaFigures(where(place_m)))

@@ -12,9 +12,8 @@ from fleetmap.sensors.samples import CameraFrame, Image
 
 STOPS = (1, 2, 3, 4, 5)
 BLUR_PX = (3, 5, 9, 17)
-_LAPLACIANS = np.array(
-    [[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32
-)  # difference of two: blind to planes and edges
+# Difference of two Laplacians: blind to planes and edges
+_LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _LAPLACIANS_GAIN = 6.0
 _MAD_SIGMA = 0.6745
 

@@ -172,7 +172,7 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
 
 
 def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
-    strays, one_way = list[Found](), list[Found]()
+    strays, one_way, doubted = list[Found](), list[Found](), list[Found]()
     for area in report.areas:
         if area.name != UNKNOWN_PLACE and not area.places and not _is_below(area.frames, settings):
             words = f"{area.name} was driven through, and is not in the map"
@@ -186,11 +186,9 @@ def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
     yield row._replace(limit="", reasons=None) if ONE_WAY in report.promises else row
     alike = [f"{one.area}: {one.frames} like {one.other}" for one in report.similar]
     yield Row(f"Areas that look alike, by {report.similar_of} frames", str(len(alike)), first_of(alike, 1))
-    doubts = [(rig.rig, subject, words) for rig in report.calibrations for subject, words in rig.doubted.items()]
-    doubted = [
-        (rig, subject, Reason(f"the calibration {rig} is in doubt: {subject}: {words}"))
-        for rig, subject, words in doubts
-    ]
+    for rig in report.calibrations:
+        for subject, words in rig.doubted.items():
+            doubted.append((rig.rig, subject, Reason(f"the calibration {rig.rig} is in doubt: {subject}: {words}")))
     yield _none("Calibrations in doubt", doubted, is_tried=any(rig.judged for rig in report.calibrations))
     yield Row("Failures a robot-day that the fleet reported", report.fleet or "too little driving")
 
