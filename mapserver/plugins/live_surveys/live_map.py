@@ -145,11 +145,11 @@ class LiveMap:
         for edge in self._loops().edges:
             whole.join(edge.i, edge.j)
         firsts = whole.labels()
-        seen = [p for p in np.unique(firsts[self._seeing]).tolist() if np.sum(firsts == p) > 1]
+        members = [np.flatnonzero(firsts == part) for part in np.unique(firsts[self._seeing])]
+        members = [part for part in members if len(part) > 1]
         labels = np.full(len(self), -1, np.int64)
-        for number, part in enumerate(seen):
-            labels[firsts == part] = number
-        members = [np.flatnonzero(labels == number) for number in range(len(seen))]
+        for number, part in enumerate(members):
+            labels[part] = number
         largest = int(np.argmax([self._seeing[m].sum() for m in members])) if members else 0
         spans = [
             LivePart(
@@ -167,10 +167,8 @@ class LiveMap:
             return None
         label = int(labels[newest])
         span = spans[label] if label >= 0 else None
-        body_from_base, odom_from_body = (
-            se3_inverse(self._rectifier.calibration.base_from_body),
-            self._news[newest].frame_from_body,
-        )
+        body_from_base = se3_inverse(self._rectifier.calibration.base_from_body)
+        odom_from_body = self._news[newest].frame_from_body
         if span is not None and not span.is_map:
             status = Status.LOST, Cause.NO_MATCH
         elif not spans:
@@ -265,9 +263,8 @@ class LiveMap:
         for pair in found:
             if pair.i == pair.j - 1:
                 edge = body_edge(pair, self._rectifier.body_from_cam)
-                carry = se3_adjoint(
-                    se3_inverse(edge.i_from_j)
-                )  # from the axes of the newest to those of the one before
+                # From the axes of the newest to those of the one before
+                carry = se3_adjoint(se3_inverse(edge.i_from_j))
                 tied = carry @ edge.cov_rot_trans @ carry.T
                 if np.trace(by_odometry[:3, :3]) > _LOST * np.trace(tied[:3, :3]):
                     return np.asarray(tied)

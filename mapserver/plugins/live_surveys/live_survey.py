@@ -64,9 +64,8 @@ class LiveTracking:
         self._run = OdometryRun(calibration, rectifier, settings)
         self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
         self._torn_m2 = 0.0  # variance of the gaps between runs of one camera
-        self._before: tuple[Array, Array, float] | None = (
-            None  # covariance and pose of the last keyframe, the gaps until then
-        )
+        # Covariance and pose of the last keyframe, the gaps until then
+        self._before: tuple[Array, Array, float] | None = None
         self._imu: list[ImuSamples] = []
 
     def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> Tracked:

@@ -175,17 +175,14 @@ def _hue(number: int) -> int:
 
 def _layers(state: LiveSurveyState) -> list[Layer]:
     """Landmarks, revisits and the path, coloured by how well it was tracked."""
-    way, marks = state.path(), state.rows("landmarks_m")
+    way, marks, loops = state.path(), state.rows("landmarks_m"), state.rows("loops_m").tolist()
     if len(way):
         low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
         marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
     return [
         Layer("Covered", _covered(state.rows("cells"))),
         Layer("Landmarks", [Dots(np.round(marks, 2).ravel().tolist())] if len(marks) else []),
-        Layer(
-            "Revisits",
-            [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in state.rows("loops_m").tolist()],
-        ),
+        Layer("Revisits", [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in loops]),
         Layer("Way", [*_part_trails(way, state), *trail(way)]),
         Layer("Now", _now(state, way)),
     ]
@@ -202,12 +199,10 @@ def _covered(cells: Array) -> list[Square]:
 
 def _now(state: LiveSurveyState, way: Array) -> list[Mark]:
     """The newest keyframe, and where directions are missing."""
-    lacking = [
-        Mark(
-            m.x_m, m.y_m, "warn", "triangle", f"nothing looks {m.heading}: {m.places} places were passed the other way"
-        )
-        for m in state.missing
-    ]
+    lacking = list[Mark]()
+    for m in state.missing:
+        words = f"nothing looks {m.heading}: {m.places} places were passed the other way"
+        lacking.append(Mark(m.x_m, m.y_m, "warn", "triangle", words))
     if not len(way):
         return lacking
     tone = "good" if way[-1, 2] > 0 else "bad"
