@@ -22,7 +22,7 @@ from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, ma
 from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.masks import check_masks_on_map
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
-from mapserver.floor_plan.plan_file import PlanFile, upwards
+from mapserver.floor_plan.plan_file import PlanFile
 from mapserver.floor_plan.rmf import RmfLevel
 from mapserver.floor_plan.survey_requests import ASKED, KIND, SurveyRequest
 from mapserver.store import Actor, MapStore
@@ -133,8 +133,9 @@ def estimate_alignment(
 
     metres_per_pixel: of the drawing, None to estimate it. StateError without a current version, UsageError for pins that give no pose.
     """
-    drawn = upwards(list(pins)) if plan is None else plan.drawn(list(pins))
-    return fit_pins(drawn, metres_per_pixel, current_corners_m(store, site), None if plan is None else plan.name)
+    if plan is not None:
+        plan.check_pins(pins)
+    return fit_pins(pins, metres_per_pixel, current_corners_m(store, site), None if plan is None else plan.name)
 
 
 def align(

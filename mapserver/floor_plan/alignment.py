@@ -7,9 +7,10 @@ import numpy as np
 
 from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import StoreError
-from fleetmap.geometry import Array, transform_points
+from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import Manifest
+from mapserver.floor_plan.areas import moved
 
 PLAN = "plan"
 """Kind of a site's file in the store that is not sent to robots."""
@@ -48,11 +49,9 @@ def map_corners_m(manifest: Manifest) -> Array:
 
 def reference_coordinates(frame: BuildingFrame, level: str, corners_m: Array) -> str:
     """Return the block of an Open-RMF fleet adapter's config.yaml: four points in both frames, from which it fits the transform."""
-    points_map = np.concatenate([corners_m, np.zeros((len(corners_m), 1))], axis=1)
-    points_building = transform_points(frame.building_from_map, points_map)
 
     def listed(points: Array) -> str:
-        return ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y, *_ in points)
+        return ", ".join(f"[{x:.4f}, {y:.4f}]" for x, y in points)
 
-    rows = ["reference_coordinates:", f"  {level}:", f"    rmf: [{listed(points_building)}]"]
-    return "\n".join([*rows, f"    robot: [{listed(points_map)}]"])
+    rows = ["reference_coordinates:", f"  {level}:", f"    rmf: [{listed(moved(corners_m, frame.building_from_map))}]"]
+    return "\n".join([*rows, f"    robot: [{listed(corners_m)}]"])

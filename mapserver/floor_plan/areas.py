@@ -337,10 +337,8 @@ def _crossing(ring: Array) -> int | None:
 
     for begin in range(0, count, _EDGES_AT_ONCE):
         block = np.s_[begin : begin + _EDGES_AT_ONCE]
-        near_x, near_y = (
-            (low[block, axis, None] <= high[:, axis]) & (high[block, axis, None] >= low[:, axis]) for axis in (0, 1)
-        )
-        n, others = np.nonzero(np.triu(near_x & near_y, begin + 1))
+        near = ((low[block, None] <= high) & (high[block, None] >= low)).all(axis=2)
+        n, others = np.nonzero(np.triu(near, begin + 1))
         n += begin
         a, b, c, d = ring[n], following[n], ring[others], following[others]
         sides = [np.sign(side(a, b, c)), np.sign(side(a, b, d)), np.sign(side(c, d, a)), np.sign(side(c, d, b))]

@@ -30,7 +30,7 @@ _Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Pin:
-    """One point. drawing: as given, for `fit_pins` right and up in the drawing's units, of a picture from its upper left corner."""
+    """One point. drawing: right and down from the drawing's upper left corner, in its units."""
 
     name: str
     drawing: tuple[float, float]
@@ -71,7 +71,7 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
     if twice:
         raise InvalidValueError(f"two pins have the name {twice[0]!r}; give each its own")
     points = np.array([complex(*pin.map_m) for pin in pins])
-    drawn = np.array([complex(*pin.drawing) for pin in pins])
+    drawn = np.array([complex(*pin.drawing) for pin in pins]).conj()
     apart_m = max(abs(a - b) for a, b in combinations(points, 2))
     if apart_m < _LEAST_APART_M:
         raise InvalidValueError(

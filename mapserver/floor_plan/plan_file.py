@@ -1,5 +1,6 @@
 """The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), checked before it is decoded."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,8 @@ class PlanFile:
     data: bytes
     grey: NDArray[np.uint8]
 
-    def drawn(self, pins: list[Pin]) -> list[Pin]:
-        """Convert pins to axes right and up. InvalidValueError for a pin outside the picture."""
+    def check_pins(self, pins: Sequence[Pin]) -> None:
+        """Raise InvalidValueError for a pin outside the picture."""
         height, width = self.grey.shape
         for pin in pins:
             if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
@@ -32,12 +33,6 @@ class PlanFile:
                 raise InvalidValueError(
                     f"pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
                 )
-        return upwards(pins)
-
-
-def upwards(pins: list[Pin]) -> list[Pin]:
-    """Convert pins from a picture's axes, where y points down."""
-    return [Pin(pin.name, (pin.drawing[0], -pin.drawing[1]), pin.map_m) for pin in pins]
 
 
 def read_plan(path: Path) -> PlanFile:

@@ -18,8 +18,7 @@ def building(points_map: np.ndarray) -> np.ndarray:
 
 def pins_at(points_map: np.ndarray, clicked_m: np.ndarray | float = 0.0, *, mirrored: bool = False) -> list[Pin]:
     right_up_m = building(points_map) + clicked_m
-    px = right_up_m / METRES_PER_PX
-    px = px * (-1, 1) if mirrored else px
+    px = right_up_m / METRES_PER_PX * (-1 if mirrored else 1, -1)
     pairs = zip(px.tolist(), points_map.tolist(), strict=True)
     return [Pin(f"p{n}", tuple(a), tuple(b)) for n, (a, b) in enumerate(pairs)]
 
