@@ -24,6 +24,7 @@ _UPKEEP_EVERY_S = 3600.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
 _AWAY_S = 10.0  # without a connection before the log says so: shorter gaps of a radio network are usual
 _REPLAY_PART_EVERY_S = 1.0  # a quarter of a megabyte: two megabits a second
+_IS = "version %s is %s: %s"
 _log = logging.getLogger(__name__)
 
 
@@ -50,7 +51,6 @@ class ServerSync:
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self.building: BuildingMaps | None = None
-        self._replayed_bytes: dict[str, int] = {}
         self.recordings_at_s = 0.0
         # The upkeep first: after a renewal whose response was lost, the server admits no other request.
         jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
@@ -171,7 +171,9 @@ class ServerSync:
         except (LinkError, MapFormatError, StoreError) as error:
             self._not_before_s[sha256] = self._clock_s() + _ASK_EVERY_S
             is_untrusted = isinstance(error, UntrustedError)
-            self._refuse(wanted, str(error), is_untrusted)
+            _log.warning(_IS, wanted.version, Change.REFUSED, error)
+            # The server knows the kind of an attack by the beginning of the words
+            self._acknowledge(str(error) if is_untrusted else f"version {wanted.version}: {error}")
             return self._running is None and not is_untrusted
         return True
 
@@ -192,7 +194,8 @@ class ServerSync:
                 if change.change is Change.POSTPONED:
                     self._offered.discard(sha256)
                     self._not_before_s[sha256] = self._clock_s() + self._retry_s
-                self._refuse(change.wanted, change.reason, how=change.change)
+                _log.warning(_IS, change.wanted.version, change.change, change.reason)
+                self._acknowledge(f"version {change.wanted.version}: {change.reason}")
             for link in self.links:
                 link.changed_version(change)
 
@@ -206,13 +209,6 @@ class ServerSync:
             fault = str(error)
             _log.warning("version %s runs but is not kept: %s", wanted.version, fault)
         self._acknowledge(fault)
-
-    def _refuse(
-        self, wanted: WantedVersion, reason: str, is_untrusted: bool = False, how: Change = Change.REFUSED
-    ) -> None:
-        """is_untrusted: the reason begins with the kind of attack, and is reported to the server unchanged."""
-        _log.warning("version %s is %s: %s", wanted.version, how, reason)
-        self._acknowledge(reason if is_untrusted else f"version {wanted.version}: {reason}")
 
     def _acknowledge(self, refused: str | None) -> None:
         """Report the running version, and why it is not the wanted one; None: as the last time."""
@@ -248,7 +244,7 @@ class ServerSync:
         now_s = self._clock_s()
         if now_s < self.recordings_at_s or self._outbox.waiting():
             return
-        goes_on = self.replays is not None and deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+        goes_on = self.replays is not None and deliver_replay_part(self.client, self.replays)
         if not goes_on and self.drives is not None:
             goes_on = self.drives.deliver_part(self.client)
         self.recordings_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)

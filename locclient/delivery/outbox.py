@@ -46,6 +46,7 @@ class Outbox:
         self._path, self._max_bytes, self._wall_ns = path, max_bytes, wall_ns
         self._is_made = False
         self.set_aside: Path | None = None
+        self.received_bytes: dict[str, int] = {}  # by the server, of reports that it gets in parts
 
     def _make(self) -> None:
         path = self._path

@@ -48,15 +48,12 @@ class ReplayQueue:
                 _log.warning("the recording of failure %s is lost: %s", report.id, error)
 
 
-def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[str, int]) -> bool:
-    """Send one part of the oldest recording; False if none waits or the server accepts none now.
-
-    received_bytes: bytes that the server has, by report id; kept by the caller between calls.
-    """
+def deliver_replay_part(client: MapClient, outbox: Outbox) -> bool:
+    """Send one part of the oldest recording; False if none waits or the server accepts none now."""
     replay = next(iter(outbox.waiting()), None)
     if replay is None:
         return False
-    offset = received_bytes.get(replay.id, 0)
+    offset = outbox.received_bytes.get(replay.id, 0)
     data = replay.payload[offset : offset + PART_BYTES]
     part = ReplayPart(id=replay.id, total_bytes=len(replay.payload), offset=offset, data=data)
     try:
@@ -73,9 +70,9 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
     elif ack.received_bytes == offset:
         return False  # the server accepted nothing
     else:
-        received_bytes[replay.id] = ack.received_bytes
+        outbox.received_bytes[replay.id] = ack.received_bytes
         return True
-    received_bytes.pop(replay.id, None)
+    outbox.received_bytes.pop(replay.id, None)
     return True
 
 

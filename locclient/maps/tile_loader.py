@@ -15,8 +15,8 @@ class TileLoader:
 
     def __init__(self, source: MapSource, settings: TileSelectionSettings) -> None:
         self._source, self.settings = source, settings
-        self._versions: dict[str, LoadedMap] = {}
-        self._selected: dict[str, frozenset[Cell]] = {}  # of those versions, unless their tiles are to be read again
+        # With the selected cells, None if tiles are to be read again
+        self._versions: dict[str, tuple[LoadedMap, frozenset[Cell] | None]] = {}
 
     def load(self, wanted: WantedVersion, bound: PositionBound) -> LoadedMap | None:
         """Load the version's tiles around the robot; None if the selection has not changed since the last call.
@@ -27,18 +27,18 @@ class TileLoader:
         if sha256 not in self._versions:
             manifest = self._source.manifest(wanted)
             vocabulary = decode_vocabulary(self._source.vocabulary(manifest))
-            self._versions[sha256] = LoadedMap(wanted, manifest, vocabulary, {})
-        known, held = self._versions[sha256], self._selected.get(sha256)
+            self._versions[sha256] = LoadedMap(wanted, manifest, vocabulary, {}), None
+        known, held = self._versions[sha256]
         cells = select_tiles(known.manifest, held, bound, self.settings)
         if cells == held:
             return None
         fetched = self._source.tiles(known.manifest, cells - known.tiles.keys() - known.refused.keys())
         tiles = {cell: tile for cell, tile in (known.tiles | fetched.tiles).items() if cell in cells}
-        self._versions[sha256] = loaded = replace(known, tiles=tiles, refused=known.refused | fetched.refused)
+        loaded = replace(known, tiles=tiles, refused=known.refused | fetched.refused)
+        self._versions[sha256] = loaded, cells if tiles or not loaded.refused else held
         if not tiles and loaded.refused:
             reasons = "; ".join(loaded.refused.values())
             raise FleetmapError(f"no tile of version {loaded.version} can be used: {reasons}"[:1000])
-        self._selected[sha256] = cells
         return loaded
 
     def grid(self, wanted: WantedVersion, robot_height_m: float) -> OccupancyGrid:
@@ -51,12 +51,9 @@ class TileLoader:
     def retry_refused(self, wanted: WantedVersion) -> None:
         """Allow refused tiles of a version to be read again, after it was fetched again."""
         sha256 = wanted.manifest_sha256 or ""
-        if sha256 in self._versions and self._versions[sha256].refused:
-            self._versions[sha256] = replace(self._versions[sha256], refused={})
-            self._selected.pop(sha256, None)
+        if sha256 in self._versions and self._versions[sha256][0].refused:
+            self._versions[sha256] = replace(self._versions[sha256][0], refused={}), None
 
     def keep_only(self, held: list[WantedVersion]) -> None:
         kept = {wanted.manifest_sha256 for wanted in held}
-        for sha256 in self._versions.keys() - kept:
-            del self._versions[sha256]
-            self._selected.pop(sha256, None)
+        self._versions = {sha256: known for sha256, known in self._versions.items() if sha256 in kept}

@@ -26,7 +26,7 @@ from fleetmap.messages import (
     WantedVersion,
     decode_message,
 )
-from mapserver.fleet.ingest import Ingest, IngestSettings
+from mapserver.fleet.ingest import Ingest, IngestSettings, Stream
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet_statistics.canary_decision import number_of
@@ -82,6 +82,7 @@ class _Robot:
     report: dict[str, Any] = field(default_factory=dict)
     last_estimate: PoseMessage | None = None
     skew: ClockSkew = field(default_factory=ClockSkew)
+    stream: Stream = field(default_factory=Stream)
     is_present: bool | None = None
     is_stored: bool = False
     copied_ns: int | None = None
@@ -199,12 +200,14 @@ class Fleet:
                         "two programs report as robot %s of site %s: give each robot its own name", robot, site
                     )
             entry.report["health"] = to_plain(health)
-            self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
+            last = (entry.version, now_ns, dict(entry.report))
+            self._ingest.take_health(entry.stream, health, entry.last_estimate, last)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
         with self._lock:
-            self._entry(site, robot, self._clock_ns(), message.map_version).last_estimate = message
-            self._ingest.take_pose(site, robot, message)
+            entry = self._entry(site, robot, self._clock_ns(), message.map_version)
+            entry.last_estimate = message
+            entry.stream.health.take_pose(message)
 
     def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:
         """Store a failure, once however often it arrives; it is on the disk when this returns.
@@ -257,7 +260,8 @@ class Fleet:
                 known = self._robots.get((info.site, info.robot))
                 if known is None or info.last_seen_ns > known.seen_ns:  # by another server
                     fresh = self._robots[info.site, info.robot] = _stored(info)
-                    fresh.copied_ns = None if known is None else known.copied_ns
+                    if known is not None:
+                        fresh.copied_ns, fresh.stream = known.copied_ns, known.stream
                     there.add((info.site, info.robot))
             for key, robot in list(self._robots.items()):
                 robot.is_present = key in there
@@ -265,7 +269,6 @@ class Fleet:
                 gone = robot.is_stored or (not robot.is_present and now_ns - robot.seen_ns > _FORGET_AFTER_NS)
                 if key not in stored and gone:
                     del self._robots[key]
-                    self._ingest.forget(key)
                 robot.is_stored = key in stored
 
     def take_copied(self, copied: Iterable[tuple[str, str]]) -> None:

@@ -16,6 +16,7 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.fleet_statistics.robot_calibration import number_of
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
+from mapserver.store.fleet_queries import LastReport
 
 Days = Annotated[float, msgspec.Meta(gt=0, le=36_500)]  # a century: 64 bits of nanoseconds hold three
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
@@ -52,7 +53,9 @@ class IngestSettings(Section, frozen=True):
 
 
 @dataclass(slots=True)
-class _Stream:
+class Stream:
+    """What is counted from of one robot's messages. For one thread at a time."""
+
     health: HealthStream = field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
     trace_map_m: tuple[float, float] | None = None
@@ -87,45 +90,28 @@ class Ingest:
         self._lock = threading.Lock()
         self._flushing = threading.Lock()
         self._batch = FleetBatch()
-        self._streams: dict[tuple[str, str], _Stream] = {}
         self._grids: dict[tuple[str, int], _Grid | None] = {}
         self._canaries: dict[str, CanaryRow] = {}
         self._canaries_ns = -(1 << 62)
         self._areas: dict[str, tuple[int, Areas]] = {}
         self._causes: dict[str, set[str]] = {}
 
-    def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
-        with self._lock:
-            self._streams.setdefault((site, robot), _Stream()).health.take_pose(message)
-
-    def forget(self, robot: tuple[str, str]) -> None:
-        """Drop the data of a removed robot (site, name)."""
-        with self._lock:
-            self._streams.pop(robot, None)
-
-    def take_health(
-        self,
-        health: RobotHealth,
-        estimate: PoseMessage | None,
-        now_ns: int,
-        report: dict[str, Any],
-        version: int | None,
-    ) -> None:
-        """Count a report; `report` and `version` are shown by the store for the robot."""
-        site, robot, hour = health.site, health.robot, hour_of(now_ns)
+    def take_health(self, stream: Stream, health: RobotHealth, estimate: PoseMessage | None, last: LastReport) -> None:
+        """Count a report. last: what the store shows of the robot."""
+        site, robot, now_ns = health.site, health.robot, last[1]
+        hour = hour_of(now_ns)
         grid = self._grid(site, health.version)
         canary, areas = self._canary(site, now_ns), self._areas_of(site, now_ns)
         with self._lock:
-            stream = self._streams.setdefault((site, robot), _Stream())
             is_continued = stream.health.in_failure and stream.hour is not None and hour > stream.hour
             counts = stream.health.take_health(health)
             stream.hour = hour
-            self._batch.last_reports[site, robot] = (version, now_ns, report)
+            self._batch.last_reports[site, robot] = last
             if counts is None:
                 return
             counts.continued = int(is_continued)
             place = None if estimate is None or estimate.map_version != health.version else estimate.position_map_m
-            for axis, key in _keys(robot, _version_key(health.version, grid), _arm(canary, health.version)):
+            for axis, key in _keys(robot, health.version, grid, _arm(canary, health.version)):
                 self._batch.add(site, axis, key, hour, counts)
             if grid is not None and place is not None:
                 self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, counts)
@@ -143,7 +129,7 @@ class Ingest:
         arm = _arm(canary, report.version) if canary is not None and happened_ns >= canary.started_ns else None
         counts = Counters(suspected=1) if report.kind == FailureKind.SUSPECTED else Counters(failures=1)
         counts.blind_failures = int(report.kind in {FailureKind.BLIND, FailureKind.NOT_FOUND})
-        keys = _keys(report.robot, _version_key(report.version, grid), arm)
+        keys = _keys(report.robot, report.version, grid, arm)
         keys.append(("cause", self._cause(report.site, report.cause)))
         if grid is not None and report.tile is not None:
             keys.append(("tile", grid.cell_key(report.tile)))
@@ -186,7 +172,7 @@ class Ingest:
         return self._store.fleet.prune(self._settings.retention())
 
     def _is_trace_due(
-        self, stream: _Stream, health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int
+        self, stream: Stream, health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int
     ) -> bool:
         """True if a trace row is due by time, or at most once a second by the distance driven or a changed status."""
         most_rows = DAY_NS / (self._settings.trace_every_s * 1e9)
@@ -244,14 +230,11 @@ class Ingest:
             return cause
 
 
-def _keys(robot: str, version: str, arm: str | None) -> list[tuple[str, str]]:
-    keys = [("site", ""), ("robot", robot), ("version", version)]
+def _keys(robot: str, version: int | None, grid: _Grid | None, arm: str | None) -> list[tuple[str, str]]:
+    """Return axes and keys; numbers are those of versions in the store, with a grid: robots cannot invent keys."""
+    known = "none" if version is None else str(version) if grid is not None else "unknown"
+    keys = [("site", ""), ("robot", robot), ("version", known)]
     return keys if arm is None else [*keys, ("arm", arm)]
-
-
-def _version_key(version: int | None, grid: _Grid | None) -> str:
-    """Return numbers of versions in the store; robots cannot invent keys."""
-    return "none" if version is None else str(version) if grid is not None else "unknown"
 
 
 def _arm(canary: CanaryRow | None, version: int | None) -> str | None:

@@ -29,8 +29,10 @@ Key = tuple[str, str, str]
 """Site, axis, key."""
 CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
-LastReports = dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]]
-"""By (site, robot): its version (None if not reported), the time of its last report, and that report."""
+LastReport = tuple[int | None, int, dict[str, Any]]
+"""Of a robot: its version (None if not reported), the time of its last report, and that report."""
+LastReports = dict[tuple[str, str], LastReport]
+"""By (site, robot)."""
 
 _DAY_NS = 86_400_000_000_000
 _USUAL_RETENTION = FleetRetention()
@@ -66,10 +68,12 @@ class FleetQueries:
     def add(self, batch: FleetBatch) -> None:
         """Store a batch in one transaction. A power cut may lose the last batches, never failures."""
         with self._database.write(durable=False) as change:
-            ids = _ids(change, [*(key[:3] for key in batch.counters), *map(_robot_key, batch.traces)])
+            traced: list[Key] = [(row.site, "robot", row.robot) for row in batch.traces]
+            ids = _ids(change, [*(key[:3] for key in batch.counters), *traced])
             _add_counters(change, ids, batch.counters)
-            traced = _TRACED.split(", ")
-            rows = [{"key_id": ids[_robot_key(row)]} | {n: getattr(row, n) for n in traced} for row in batch.traces]
+            columns = _TRACED.split(", ")
+            traces = zip(traced, batch.traces, strict=True)
+            rows = [{"key_id": ids[key]} | {name: getattr(row, name) for name in columns} for key, row in traces]
             change.insert("traces", rows, "ON CONFLICT DO NOTHING")
             keep_last_reports(change, batch.last_reports)
 
@@ -299,10 +303,6 @@ def keep_last_reports(change: Transaction, reports: LastReports) -> None:
 def tile_key(tile: tuple[int, int] | None) -> str | None:
     """Return a tile as text for keys and rows: "x,y"."""
     return None if tile is None else f"{tile[0]},{tile[1]}"
-
-
-def _robot_key(row: TraceRow) -> Key:
-    return row.site, "robot", row.robot
 
 
 def _ids(change: Transaction, keys: Iterable[Key]) -> dict[Key, int]:
