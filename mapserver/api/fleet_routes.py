@@ -12,9 +12,10 @@ from fleetmap.mapformat.names import sha256_hex
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
+from mapserver.api.moments import hours_within
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
-from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
+from mapserver.fleet_statistics.kpis import HOUR_NS, kpis
 from mapserver.fleet_statistics.resurvey_decision import route_geojson
 from mapserver.store import FailureRow
 
@@ -23,9 +24,7 @@ _MAX_PAGE_BYTES = 4_000_000
 
 def _span(within: p.TimeRange, hours: p.Hours = 24) -> tuple[int, int]:
     """Return the first hour since 1970, and that behind the last."""
-    since_ns, until_ns = within
-    end = hour_of(time.time_ns()) + 1 if until_ns is None else hour_of(until_ns - 1) + 1
-    return end - hours if since_ns is None else hour_of(since_ns), end
+    return hours_within(*within, time.time_ns(), hours)
 
 
 Asked = Annotated[tuple[int, int], Depends(_span)]

@@ -5,9 +5,9 @@ from datetime import UTC, date, datetime, timedelta, tzinfo
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from fleetmap.errors import InvalidValueError
+from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of
 
 _LATEST_YEAR = 2200
-_HOUR_NS = 3_600_000_000_000
 _NAME = re.compile(r"[A-Za-z0-9_+\-/]{1,64}", re.ASCII)
 _LOST_PLUS = re.compile(r"(T[\d:.]+) (\d\d:?\d\d)$")  # `+` in a URL means a space
 
@@ -74,9 +74,9 @@ def steps(first_ns: int, end_ns: int, step_ns: int, zone: tzinfo | None) -> list
     offset = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).astimezone(zone).utcoffset() or timedelta()
     offset_ns = offset // timedelta(microseconds=1) * 1000
     begin_ns = (first_ns + offset_ns) // step_ns * step_ns  # as the clock shows it
-    more = 3 + 24 * _HOUR_NS // step_ns  # a zone that crosses the date line loses a day
+    more = 3 + 24 * HOUR_NS // step_ns  # a zone that crosses the date line loses a day
     edges = [begin_ns + n * step_ns for n in range((end_ns + offset_ns - begin_ns) // step_ns + more)]
-    if step_ns > _HOUR_NS:
+    if step_ns > HOUR_NS:
         shown = (datetime.fromtimestamp(edge // 1_000_000_000, UTC).replace(tzinfo=None) for edge in edges)
         edges = [_local_ns(at, zone)[0] for at in shown]
     else:
@@ -104,3 +104,9 @@ def read_range(since: str | None, until: str | None, zone: tzinfo | None = None)
             f"until {(until or '')[:40]!r} is not after since {(since or '')[:40]!r}; exchange them"
         )
     return start_ns, end_ns
+
+
+def hours_within(since_ns: int | None, until_ns: int | None, now_ns: int, usual_h: int) -> tuple[int, int]:
+    """Return the hours that a time lies in, the end excluded. usual_h: their number where the time has no beginning."""
+    end = hour_of(now_ns if until_ns is None else until_ns - 1) + 1
+    return (end - usual_h if since_ns is None else hour_of(since_ns)), end

@@ -49,15 +49,6 @@ _RIGHTS = {
 }
 
 
-class Row(NamedTuple):
-    """What expires, in words."""
-
-    name: str
-    tone: str
-    left: str
-    remark: str
-
-
 def page(services: Services, _: PageContext) -> dict[str, object]:
     """What the template needs."""
     store, settings, now_ns = services.maps.store, services.settings, time.time_ns()
@@ -99,15 +90,15 @@ def _disk(found: ServerHealth) -> list[tuple[str, str, int]]:
     return [*own, ("shade-5", named, max(0, others)), ("free", "Free", found.disk.free_bytes)]
 
 
-def ending_row(ending: Ending) -> Row:
+def ending_row(ending: Ending) -> tuple[str, str, str, str]:
     """Name, tone, time left and remark; who only has to wait for the server is told so."""
     name = _NAMES.get(ending.name) or f"Maps of {ending.name.removeprefix('site-')}"
     remark = ending.fault or (_RENEWED if ending.name.startswith(_BY_SERVER) else "")
     days = ending.days_left
     if days is None:
-        return Row(name, "bad", "unknown", remark)
+        return name, "bad", "unknown", remark
     left = "ended" if days <= 0 else f"{24 * days:.0f} h" if days < 2 else f"{days:.0f} days"
-    return Row(name, "good" if not ending.fault else "warn" if days > 0 else "bad", left, remark)
+    return name, "good" if not ending.fault else "warn" if days > 0 else "bad", left, remark
 
 
 class _Robot(NamedTuple):
@@ -130,7 +121,7 @@ def people(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
     store, now_ns = services.maps.store, time.time_ns()
     enrolled = {row.robot: row for row in enrolled_of(store, context.site)}
-    heard = {robot.name: robot for robot in services.robots.look(context.site).robots}
+    heard = {robot.name: robot for robot in services.robots.look(context.site)}
     robots = [_Robot(name, heard.get(name), enrolled.get(name)) for name in {*enrolled, *heard}]
     return {
         "allowed": {line.detail: line for line in reversed(store.log(site=context.site, kind="robot enrolled"))},

@@ -4,20 +4,21 @@ What a page needs to know goes into `fill`; what moves from second to second com
 now and then is fetched anew by `static/renew.js`. Acts are requests to the HTTP API, by `static/acts.js`.
 """
 
-import asyncio
 import time
+from asyncio import sleep, to_thread
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, date, tzinfo
+from datetime import UTC, date, timedelta, tzinfo
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Template
 from markupsafe import Markup
+from starlette.datastructures import QueryParams
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, StoreError, UsageError
@@ -28,19 +29,16 @@ from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.map_layers import Layer, box_around, ground, heat
+from mapserver.dashboard.map_layers import Layer, box_around, ground, heat, with_areas
 from mapserver.dashboard.rendering import TEMPLATES, address, age
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.operators.roles import Scope
-
-T = TypeVar("T")
 
 PATH = "/dashboard"
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 RANGE = ("since", "until")
 """The parameters by which every address keeps a range of time."""
 
-_WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0
 _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 
@@ -97,13 +95,17 @@ class PageContext:
 
     def range_presets(self, usual: str) -> list[tuple[str, str]]:
         """Ranges of one click: their words and addresses. usual: words of none."""
-        now_ns = time.time_ns()
-        day, today = self.written(now_ns - 24 * HOUR_NS), self.written(now_ns)[:10]
-        hour, week = self.written(now_ns - HOUR_NS), self.written(now_ns - _WEEK_NS)
-        monday = self.written(now_ns - 24 * HOUR_NS * date.fromisoformat(today).weekday())[:10]
-        found = {"Last hour": hour, "Today": today, "Last 24 h": day, "Since Monday": monday, "Last 7 days": week}
+        now_ns, today = time.time_ns(), date.fromisoformat(self.today)
+        hour, day, week = (self.written(now_ns - hours * HOUR_NS) for hours in (1, 24, 7 * 24))
+        monday = str(today - timedelta(today.weekday()))
+        found = {"Last hour": hour, "Today": self.today, "Last 24 h": day, "Since Monday": monday, "Last 7 days": week}
         kept = self.kept_in_range()
         return [(words, address("", **kept, since=since)) for words, since in (found | {usual: None}).items()]
+
+    @property
+    def today(self) -> str:
+        """The day, as `since` of an address takes it."""
+        return self.written(time.time_ns())[:10]
 
     def kept_in_range(self) -> dict[str, str]:
         """The parameters of the address that stay when another range is chosen."""
@@ -210,14 +212,16 @@ class Console:
         @self.app.get(f"/{path}", include_in_schema=False)
         async def followed(request: Request, site: str) -> StreamingResponse:
             """A stream of server-sent events."""
-            chosen = site if site in await load(under_way, site) else await load(self.services.maps.chosen_site, site)
-            zone = zone_of(request.cookies.get(_ZONE_COOKIE))
-            context = PageContext(_root(request), chosen, zone, request.query_params)
+            chosen = (
+                site
+                if site in await to_thread(under_way, site)
+                else await to_thread(self.services.maps.chosen_site, site)
+            )
+            context = PageContext(_root(request), chosen, _zone(request), request.query_params)
             guard, ended = self.services.settings.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
 
             def event() -> bytes:
-                is_signed_in = getattr(request.state, "operator", None) is not None
-                if is_signed_in and guard.identify(request.scope, uses=False) is None:
+                if guard.is_sign_in_on and guard.identify(request.scope, uses=False) is None:
                     return ended
                 found = one(self.services, context, **request.path_params)
                 if shows:
@@ -229,38 +233,42 @@ class Console:
             async def events() -> AsyncIterator[bytes]:
                 told = b""
                 while told != ended and not await request.is_disconnected():
-                    found = await load(event)
+                    found = await to_thread(event)
                     yield b":\n\n" if found == told else found
                     told = found
-                    await asyncio.sleep(_EVERY_S)
+                    await sleep(_EVERY_S)
 
             return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
     async def _shown(self, request: Request, page: Page) -> Response:
-        template, site, found, status = page.template, request.query_params.get("site"), {}, 200
-        root, sites = _root(request), list[str]()
+        template, root, query, status = page.template, _root(request), request.query_params, 200
+        site, sites = query.get("site"), list[str]()
         try:
-            growing, stored = await load(page.under_way, site), await load(self.services.maps.sites)
+            growing, stored = await to_thread(page.under_way, site), await to_thread(self.services.maps.sites)
             sites = sorted({*stored, *growing})
             if site is None and growing:
                 site = growing[0]
             elif not page.of_site:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
-                lost = await load(self.services.robots.lost) if site is None else ()
-                site = await load(self.services.maps.chosen_site, next((one for one in lost if one in stored), site))
+                lost = await to_thread(self.services.robots.lost) if site is None else ()
+                site = await to_thread(
+                    self.services.maps.chosen_site, next((one for one in lost if one in stored), site)
+                )
             known = ("site", "find", *RANGE, *page.knows)
-            if unknown := [name for name in request.query_params if name not in known]:
+            if unknown := [name for name in query if name not in known]:
                 names = ", ".join(known)
                 raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
-            zone = zone_of(request.cookies.get(_ZONE_COOKIE))
-            context = PageContext(root, site, zone, request.query_params)
-            found = {"context": context} | await load(lambda: page.fill(self.services, context, **request.path_params))
+            context = PageContext(root, site, _zone(request), query)
+            found = {"context": context} | await to_thread(
+                lambda: page.fill(self.services, context, **request.path_params)
+            )
+            site = str(found.get("site", site))  # a failure and a job have one, whatever the address names
         except FleetmapError as error:
-            template, found = "problem.html", {"words": str(error)}
+            template, query, found = "problem.html", QueryParams(), {"words": str(error)}
             status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
-        here = PageContext(root, site or "", query=request.query_params if status == 200 else {})
+        here = PageContext(root, site or "", query=query)
         kept = here.range_kept
         listed = f"{root}/{page.under if page.under in self.links else ''}"  # what is of one site is not looked for in another
         look = request.cookies.get(_LOOK_COOKIE, "")
@@ -286,11 +294,6 @@ class Console:
         if request.headers.get("if-none-match") == headers["ETag"]:  # renew.js has it
             return Response(status_code=304, headers=headers)
         return HTMLResponse(text, status, headers)
-
-
-async def load(function: Callable[..., T], *arguments: object) -> T:
-    """Result of a blocking function, computed on another thread."""
-    return await asyncio.to_thread(function, *arguments)
 
 
 def number(text: str | None, name: str) -> int | None:
@@ -324,7 +327,7 @@ def scene_of(
     below = services.maps.underlays(context.site, version, context.root)
     picture, areas = context.plan_picture(version), services.maps.store.areas(context.site)
     layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]
-    box = box_around(places_m, plan.box)
+    box = box_around(places_m, with_areas(plan.box, areas))
     return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}
 
 
@@ -334,9 +337,14 @@ def _rights(request: Request) -> dict[str, object]:
     return {
         "api": PageContext(_root(request), "").api,
         "person": who,
-        "may_change": who is None or Scope.CHANGE in who.scopes,
-        "may_administer": who is None or Scope.OPERATORS in who.scopes,
+        "may": (may := frozenset[str](Scope) if who is None else who.scopes),
+        "may_change": Scope.CHANGE in may,
+        "may_administer": Scope.OPERATORS in may,
     }
+
+
+def _zone(request: Request) -> tzinfo | None:
+    return zone_of(request.cookies.get(_ZONE_COOKIE))
 
 
 def _root(request: Request) -> str:

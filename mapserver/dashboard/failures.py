@@ -11,9 +11,11 @@ from typing import NamedTuple
 from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureKind
 from mapserver.api.incidents import incidents, of_failure
+from mapserver.api.moments import read_moment
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
+from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
-from mapserver.dashboard.fleet_parts import bar_edges
+from mapserver.dashboard.fleet_parts import bar_edges, page_of
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.fleet.alerts import Incident, with_acts
 from mapserver.store import FailureFilter, FailureRow
@@ -27,13 +29,14 @@ Chosen = Mapping[str, str]
 class Facet(NamedTuple):
     """An axis by which failures are chosen.
 
-    choices: values, how many failures choosing each shows, and the address that does so; of a chosen one, that which takes the choice back.
+    choices: values, how many failures choosing each shows, and the address that does so; of a chosen one, that which takes the choice back;
+    then how many of today, and their address, as long as no time is chosen.
     """
 
     axis: str
     title: str
     chosen: str | None
-    choices: list[tuple[str, int, str]]
+    choices: list[tuple[str, int, str, int, str]]
 
 
 ADVICE: dict[str, str] = {
@@ -93,12 +96,14 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "facets": facets,
         "shades": shades,
         "advice": ADVICE,
-        "chart": _chart(context, matching, shades, chosen) if matching else None,
+        "chart": _chart(context, matching, shades, kept) if matching else None,
         # where the listed ones are, and where all that match are dense
         "scene": scene_of(services, context, drawn, [Layer("Failures", failure_marks(context, shown))], dense_m=dense),
         "rows": shown,
         "held": held(services, shown),
-        "incidents": sorted(found_open, key=lambda one: one.state != "open"),
+        "incidents": [
+            (one, context.to(page_of(one))) for one in sorted(found_open, key=lambda one: one.state != "open")
+        ],
         "pictures": kept_failures.first_pictures(row.number for row in shown),
         "older": context.to("failures", **kept, older=shown[-1].number) if len(found) > len(shown) else None,
     }
@@ -141,26 +146,32 @@ def _facets(
     context: PageContext, rows: Sequence[FailureRow], chosen: Chosen, kept: Chosen, areas: Sequence[str]
 ) -> list[Facet]:
     """For each axis its values, those with most failures first. kept: query parameters."""
-    found = []
+    found, day = [], read_moment(context.today, "today", context.zone) or 0
+    of_today = [row for row in rows if row.happened_ns >= day] if context.time_range() == EVER else []
     for axis, title in AXES.items():
         own = chosen.get(axis)
         counts = Counter(dict.fromkeys(areas if axis == "area" else (), 0))
         counts.update([] if own is None else {own: 0})
-        counts.update(value for row in rows if _fits(row, chosen, axis) and (value := _value(row, axis)))
+        all_days, today = (
+            Counter(_value(row, axis) for row in of if _fits(row, chosen, axis)) for of in (rows, of_today)
+        )
+        counts.update({value: count for value, count in all_days.items() if value})
         if not counts or (axis == "tile" and areas and not own):
             continue
-        choices = [
-            (value, count, context.to("failures", **{**kept, axis: None if value == own else value}))
-            for value, count in counts.most_common()
-        ]
+        choices = []
+        for value, count in counts.most_common():
+            to = {**kept, axis: None if value == own else value}
+            to_today = {**kept, axis: value, "since": context.today, "until": None}
+            addresses = [context.to("failures", **query) for query in (to, to_today)]
+            choices.append((value, count, addresses[0], today[value], addresses[1]))
         found.append(Facet(axis, title, own, choices))
     return found
 
 
 def _chart(
-    context: PageContext, rows: Sequence[FailureRow], shades: Mapping[str, int], chosen: Chosen
+    context: PageContext, rows: Sequence[FailureRow], shades: Mapping[str, int], kept: Chosen
 ) -> dict[str, object]:
-    """Failures over time in bars, parted by cause; in percent of the highest. A bar leads to its time."""
+    """Failures over time in bars, parted by cause; in percent of the highest. A bar leads to its time. kept: query parameters."""
     since_ns, until_ns = context.time_range()
     times = [row.happened_ns for row in rows]
     first_ns, end_ns = since_ns or min(times), until_ns or max(time.time_ns(), max(times) + 1)
@@ -179,7 +190,7 @@ def _chart(
         told = ", ".join(f"{part} {cause.replace('_', ' ') or 'unknown'}" for cause, part in count.most_common())
         span = {"since": context.written(start_ns), "until": context.written(stop_ns)}
         words = f"{context.moment(start_ns)}, {step}: {told or 'none'}"
-        bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
+        bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**kept, **span})})
     ends = [context.written(ns)[:16].replace("T", " ") for ns in (edges[0], end_ns)]
     return {"bars": bars, "most": most, "step": step, "ends": ends, "span": (edges[0], edges[-1])}
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
+from mapserver.api.moments import hours_within
 from mapserver.dashboard.data import MANY_SITES, Kept
 from mapserver.dashboard.fleet_parts import Trial
 from mapserver.fleet.alerts import Incident
@@ -40,8 +41,7 @@ class SiteHealth:
     """A site's figures. day: the last 24 h; days: rates of 24 h each, oldest first, the last ends now.
 
     robots: each one's figures of the last 24 h. trend: how day compares with the 7 days before, in words. areas: the last 7 days beside
-    the 7 before them by named area, or by tile where none is named, from week_since_ns on. alerts: of the site and the
-    server.
+    the 7 before them by named area, or by tile where none is named. alerts: of the site and the server.
     """
 
     day: Kpis
@@ -51,7 +51,6 @@ class SiteHealth:
     trials: tuple[Trial, ...]
     resurvey: tuple[TileConcern, ...]
     areas: tuple[AreaTrend, ...]
-    week_since_ns: int
     alerts: tuple[Incident, ...]
 
 
@@ -71,8 +70,7 @@ class HealthData:
 
     def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:
         """A site's figures of whole hours: those that both ends lie in, too."""
-        first = 0 if since_ns is None else hour_of(since_ns)
-        end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
+        first, end = hours_within(since_ns or 0, until_ns, self._clock_ns(), 0)
         return kpis(_sum(self._store.fleet.hours(site, "site", since_hour=first, until_hour=end), first, end))
 
     def rates(self, site: str, edges_ns: Sequence[int]) -> list[Rate]:
@@ -126,14 +124,12 @@ class HealthData:
             tuple((row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self.area_trends(site, None, None)),
-            (next_hour - WEEK_H) * HOUR_NS,
             tuple(alert for alert in self._alerts(now_ns) if alert.site in {"", site}),
         )
 
     def area_trends(self, site: str, since_ns: int | None, until_ns: int | None) -> list[AreaTrend]:
         """Areas in whole hours of a time, or tiles where none is named, beside the 7 days before it; without a start its last 7 days."""
-        end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
-        first = end - WEEK_H if since_ns is None else hour_of(since_ns)
+        first, end = hours_within(since_ns, until_ns, self._clock_ns(), WEEK_H)
         axis = "area" if self._store.areas(site) else "tile"
         spans = (first, end), (first - WEEK_H, first)
         return area_trends(*(self._store.fleet.counters_of(site, axis, *span) for span in spans))

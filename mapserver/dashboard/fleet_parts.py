@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from mapserver.api.moments import steps
 from mapserver.dashboard.rendering import begun, share
+from mapserver.fleet.alerts import Incident
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate, driven_words, figure, format_rate
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure
@@ -31,6 +32,17 @@ _BARS = 42
 
 Choice = tuple[str, bool, str]
 """Something to choose or to take back: its words, whether it is chosen, and the address that does it."""
+
+
+# The page that says more of an incident; "{}": what it is about.
+_PAGES = {"draft": "map", "recording": "surveys", "failure": "failures/{}", "FleetmapFailureRate": "failures"}
+_PAGES |= {"FleetmapNightFailed": "surveys", "FleetmapCanaryRolledBack": "trends"}
+_PAGES |= {"FleetmapDiskFills": "administration", "FleetmapTrustFault": "administration"}
+
+
+def page_of(incident: Incident) -> str:
+    """The path of the page that says more of an incident, that of its robot for alerts of robots."""
+    return _PAGES.get(incident.name, "robots/{}").format(incident.about)
 
 
 class Figure(NamedTuple):

@@ -18,7 +18,7 @@ from fleetmap.hooks import plugins
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
 from mapserver.api.parameters import ApiSettings
-from mapserver.dashboard import administration, docs, failure, failures, map_page, overview, robot, robots, survey_jobs
+from mapserver.dashboard import administration, docs, failure, failures, map_page, overview, robot, survey_jobs
 from mapserver.dashboard.console import PATH, Console, Page, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -99,7 +99,7 @@ def _install_pages(console: Console) -> None:
     console.page("", Page("overview.html", overview.page, link=_link("Overview")))
     console.stream("now", overview.now, shows=("fleet",))
     console.page("trends", Page("trends.html", overview.trends, link=_link("Trends"), usual="Last 24 h"))
-    console.page("robots", Page("robots.html", robots.page, link=_link("Robots"), knows=("state", "without")))
+    console.page("robots", Page("robots.html", overview.robots, link=_link("Robots"), knows=("state", "without")))
     console.page("robots/{robot}", Page("robot.html", robot.page, usual="Last drive"))
     console.stream("robots/{robot}/now", robot.now, shows=("robot", "facts"))
     compared = ("version", "before", "after")

@@ -87,21 +87,6 @@ class LiveRobot:
         return [Mark(x, y, self.tone, shape, words, address, self.name, self.heading_rad)]
 
 
-@dataclass(frozen=True, slots=True)
-class LiveSite:
-    """All robots of a site, those in trouble first."""
-
-    robots: tuple[LiveRobot, ...]
-
-    def count(self, tone: str) -> int:
-        """How many robots are in a tone."""
-        return sum(robot.tone == tone for robot in self.robots)
-
-    def robot(self, name: str) -> LiveRobot | None:
-        """The robot of a name, None where it was never heard."""
-        return next((robot for robot in self.robots if robot.name == name), None)
-
-
 ORDER = {"bad": 0, "warn": 1, "quiet": 2, "good": 3}
 
 
@@ -109,20 +94,24 @@ class LiveRobots:
     """Reads the fleet at most about once a second, for any number of pages."""
 
     def __init__(self, fleet: Fleet, clock_s: Callable[[], float]) -> None:
-        self.fleet, self._all = fleet, Kept[LiveSite](1, _CACHED_S, clock_s)
+        self.fleet, self._all = fleet, Kept[list[LiveRobot]](1, _CACHED_S, clock_s)
 
-    def look(self, site: str) -> LiveSite:
-        """The site's robots as of now."""
-        return LiveSite(tuple(robot for robot in self._look().robots if robot.status.site == site))
+    def look(self, site: str) -> list[LiveRobot]:
+        """The site's robots as of now, those in trouble first."""
+        return [robot for robot in self._look() if robot.status.site == site]
+
+    def robot(self, site: str, name: str) -> LiveRobot | None:
+        """The robot of a name, None where it was never heard."""
+        return next((robot for robot in self.look(site) if robot.name == name), None)
 
     def lost(self) -> dict[str, int]:
         """How many robots of each site are not localised; the site with most of them first, none without."""
-        return dict(Counter(robot.status.site for robot in self._look().robots if robot.tone == "bad").most_common())
+        return dict(Counter(robot.status.site for robot in self._look() if robot.tone == "bad").most_common())
 
-    def _look(self) -> LiveSite:
-        def read() -> LiveSite:
+    def _look(self) -> list[LiveRobot]:
+        def read() -> list[LiveRobot]:
             robots = map(live_robot, self.fleet.robots())
-            return LiveSite(tuple(sorted(robots, key=lambda one: (ORDER.get(one.tone, 1), counted(one.name)))))
+            return sorted(robots, key=lambda one: (ORDER.get(one.tone, 1), counted(one.name)))
 
         return self._all.get("", read)
 

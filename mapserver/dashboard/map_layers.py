@@ -4,7 +4,7 @@ Maps draw these by `static/map/index.js`; the field `kind` says how.
 """
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -109,6 +109,13 @@ def box_around(places_m: Sequence[tuple[float, float]], box: Box) -> Box:
     return (x0, y0, x1, y1)
 
 
+def with_areas(box: Box, areas: Areas) -> Box:
+    """A map's box and the named areas, which may lie beyond all landmarks."""
+    corners = np.concatenate([np.reshape(box, (2, 2)), *(ring for area in areas.areas for ring in area.rings)])
+    (x0, y0), (x1, y1) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+    return (x0, y0, x1, y1)
+
+
 def ground(
     plan: Plan, picture_address: str, areas: Areas, below: Sequence[Layer] = (), *, shows_coverage: bool = False
 ) -> list[Layer]:
@@ -139,11 +146,6 @@ def coverage(plan: Plan) -> list[Square]:
         square(plan, (t.x, t.y), "tile", f"{t.landmarks} landmarks", full=round(t.landmarks / most, 3))
         for t in plan.tiles
     ]
-
-
-def squares(plan: Plan, kinds: Mapping[tuple[int, int], str]) -> list[Square]:
-    """Tiles by what became of them: added, changed or removed."""
-    return [square(plan, place, kind, kind) for place, kind in sorted(kinds.items())]
 
 
 def square(plan: Plan, place: tuple[int, int], tone: str, words: str, *, full: float = 1.0) -> Square:

@@ -9,7 +9,7 @@ from fleetmap.errors import FleetmapError
 from mapserver.api.incidents import of_drafts
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
-from mapserver.dashboard.map_layers import Layer, Outline, Picture, squares
+from mapserver.dashboard.map_layers import Layer, Outline, Picture, square
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import AreaCorrections
@@ -76,7 +76,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
     verdicts = maps.store.last_verdicts(site)
     refused = {one.about: one for one in with_acts(maps.store, of_drafts(maps.store, site))}
-    robots = [robot.status.version for robot in services.robots.look(site).robots]
+    robots = [robot.status.version for robot in services.robots.look(site)]
     asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
     known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
     shown = next((number for number in known if number is not None), None)
@@ -91,8 +91,9 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     others = [one for one in requests if one.corners_map_m not in drawn]
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
     failed = {"Failures": services.health.places(site, *span_ns)}
+    tiles = [square(plan, place, kind, kind) for place, kind in sorted(changes["tiles"].items())]
     over = [
-        Layer("Changed tiles", squares(plan, changes["tiles"]), shown=compares),
+        Layer("Changed tiles", tiles, shown=compares),
         Layer("Requested surveys", asked_for),
         Layer("Outline that you draw"),
     ]

@@ -1,35 +1,47 @@
-"""The first pages: Overview (does anything need me?) and Trends (what got worse?). Templates filled from the same functions as the other
-pages; the Overview is kept up to date by a stream of server-sent events.
-"""
+"""The first pages: Overview (does anything need me?), Robots (which, and what is different about them?) and Trends (what got worse?)."""
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from fleetmap.errors import UsageError
 from fleetmap.messages import Flag
+from mapserver.api.moments import hours_within
 from mapserver.dashboard import fleet_parts
+from mapserver.dashboard.administration import cannot_enrol
 from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
-from mapserver.dashboard.fleet_health import DAYS_SHOWN, SiteHealth
-from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges
-from mapserver.dashboard.live import LiveRobot, LiveSite
+from mapserver.dashboard.fleet_health import DAYS_SHOWN, WEEK_H, SiteHealth
+from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges, page_of
+from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import Incident, dropped_words, with_acts
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, figure
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, figure, hour_of, kpis
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
-from mapserver.floor_plan.areas import OUTSIDE, Areas
+from mapserver.floor_plan.areas import OUTSIDE
+from mapserver.trust.enrolment import RobotRegister
 
-# The page that says more of an alert; those of robots and trials have words of their own.
-_ALERTS = {"FleetmapNightFailed": "surveys", "FleetmapFailureRate": "failures"} | dict.fromkeys(
-    ("FleetmapDiskFills", "FleetmapTrustFault"), "administration"
-)
+_COLUMNS = {
+    "state": "State",
+    "since": "Since",
+    "where": "Where",
+    "remarks": "To look at",
+    "map": "Map version",
+    "cpu": "CPU of a frame",
+    "failures": "Failures, 24 h",
+    "dropped": "Drops, 24 h",
+}
 _NAMES = 7  # below bars
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
+
+
+Row = tuple[LiveRobot, Kpis, dict[str, str]]
+"""A robot in a list, its figures of the last 24 h, and its words by column; `exact`: since which moment; `to`: the address of its page."""
 
 
 class Notice(NamedTuple):
@@ -45,7 +57,7 @@ class Notice(NamedTuple):
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
     live, version = services.robots.look(context.site), services.maps.current_version(context.site)
-    places = [robot.place_m for robot in live.robots if robot.place_m is not None]
+    places = [robot.place_m for robot in live if robot.place_m is not None]
     shown, dense = [Layer("Robots", _marks(context, live))], {"Failures": services.health.places(context.site)}
     in_sight = places if len(places) > _MANY else ()
     scene = scene_of(services, context, version, shown, dense_m=dense, places_m=in_sight)
@@ -55,19 +67,18 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
 def now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
-    areas = services.maps.store.areas(context.site)
-    levels, (floors, guests) = services.maps.levels(context.site), _floors(services, context)
-    week_ns = health.week_since_ns
-    alerts, own = alerts_of(services, health)
-    robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
+    end_ns = (hour_of(time.time_ns()) + 1) * HOUR_NS
+    (floors, guests), (alerts, own) = _floors(services, context), alerts_of(services, health)
+    rows = _rows(services, context)
+    rows.sort(key=lambda row: row[0].tone in {"good", "quiet"} and not _is_troubled(row[0]))
     return {
         "line": site_line(live),
         "notices": _notices(services, context, health, alerts),
         "figures": _figures(live, health),
         "days": [] if health.day.failures.low is None else [day.per_robot_day for day in health.days],
-        "span": (week_ns - 7 * 24 * HOUR_NS, week_ns + 7 * 24 * HOUR_NS),
+        "span": (end_ns - DAYS_SHOWN * 24 * HOUR_NS, end_ns),
         "trends": context.to("trends"),
-        "robots": [_robot(context, robot, health, areas, levels, own.get(robot.name)) for robot in robots] + guests,
+        "robots": [_listed(row, own.get(row[0].name)) for row in rows] + guests,
         "marks": _marks(context, live),
         "floors": floors,
     }
@@ -76,47 +87,47 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
 def alerts_of(services: Services, health: SiteHealth) -> tuple[list[Incident], dict[str, Incident]]:
     """All alerts that are not closed; those of robots by their names, an open one before others."""
     alerts = [one for one in with_acts(services.maps.store, health.alerts) if one.state != "closed"]
-    own = {one.about: one for one in sorted(alerts, key=lambda one: one.state == "open") if one.name not in _ALERTS}
+    of_robots = (one for one in alerts if page_of(one).startswith("robots/"))
+    own = {one.about: one for one in sorted(of_robots, key=lambda one: one.state == "open")}
     return alerts, own
 
 
 def _floors(services: Services, context: PageContext) -> tuple[list[Choice], list[dict[str, object]]]:
     """The floors of the site's building with the robots on each, the highest first; and the robots of other floors that are on this one."""
     site, levels = context.site, services.maps.levels(context.site)
-    robots = [robot for floor in levels for robot in services.robots.look(floor).robots]
+    robots = [robot for floor in levels for robot in services.robots.look(floor)]
     counts = Counter(robot.floor or robot.status.site for robot in robots if robot.tone != "quiet")
     floors = [
         (f"{level} ({counts[floor]})", floor == site, context.to("", site=floor))
         for floor, level in reversed(levels.items())
     ]
     guests = []
-    for robot in robots:
-        if robot.floor == site:
-            own = replace(context, site=robot.status.site)
-            row = _robot(own, robot, services.health.site(own.site), Areas(), levels)
-            guests.append(
-                row | {"name": f"{robot.name} of {own.site}", "about": "on this floor: it tells no position here"}
-            )
+    for row in (row for floor in levels for row in _rows(services, replace(context, site=floor))):
+        if row[0].floor == site:
+            named = {
+                "name": f"{row[0].name} of {row[0].status.site}",
+                "about": "on this floor: it tells no position here",
+            }
+            guests.append(_listed(row) | named)
     return floors, guests
 
 
-def site_line(live: LiveSite) -> Sentence:
+def site_line(live: Sequence[LiveRobot]) -> Sentence:
     """One sentence for all robots."""
-    online = [robot for robot in live.robots if robot.tone != "quiet"]
-    lost, unsure = live.count("bad"), live.count("warn")
-    if not live.robots:
+    online, tones = [robot for robot in live if robot.tone != "quiet"], Counter(robot.tone for robot in live)
+    if not live:
         return Sentence("quiet", "No robot of this site has reported yet; locclient run on a robot does.")
     if not online:
-        last_s = min(robot.status.seconds_since for robot in live.robots)
+        last_s = min(robot.status.seconds_since for robot in live)
         return Sentence("quiet", f"All robots are offline; the last one reported {age(last_s)} ago.")
     troubled = sum(map(_is_troubled, online))
-    counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "localised with a problem"))
+    counts = ((tones["bad"], "not localised"), (tones["warn"], "uncertain"), (troubled, "localised with a problem"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
         all_of_them = f"All {len(online)} robots online are" if len(online) > 1 else f"{online[0].name} is"
         return Sentence("good", f"{all_of_them} localised.")
     told = f"Of {len(online)} robot{'s' * (len(online) > 1)} online: {', '.join(parts)}."
-    return Sentence("bad" if lost else "warn", told)
+    return Sentence("bad" if tones["bad"] else "warn", told)
 
 
 def _is_troubled(robot: LiveRobot) -> bool:
@@ -154,45 +165,91 @@ def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
     return age(max(0.0, time.time() - since_ns / 1e9)), context.moment(since_ns) or ""
 
 
-def _robot(
-    context: PageContext,
-    robot: LiveRobot,
-    health: SiteHealth,
-    areas: Areas,
-    levels: Mapping[str, str],
-    alert: Incident | None = None,
-) -> dict[str, object]:
-    """One row of the list. alert: of the robot."""
-    words, own = remarks(robot), health.robots.get(robot.name)
-    words += [f"{alert.assignee} has it"] if alert is not None and alert.assignee else []
-    failures = 0 if own is None else own.failures.events + own.failures_running
-    words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
-    if own is not None and own.silent_estimated.events:
-        words.append(f"suspected failures: {own.silent_estimated.events}")
-    since, exact = ("", "") if robot.tone == "good" else since_words(context, robot)
-    since += " ago" if robot.tone == "quiet" else ""
+def _rows(services: Services, context: PageContext) -> list[Row]:
+    """All robots, those in trouble first."""
+    site, rows = context.site, list[Row]()
+    days, areas, levels = services.health.site(site).robots, services.maps.store.areas(site), services.maps.levels(site)
+    for robot in services.robots.look(site):
+        day, cpu_ms = days.get(robot.name) or kpis(Counters()), robot.metrics.get("frame_ms_mean")
+        since, exact = since_words(context, robot)
+        words = {
+            "state": robot.words,
+            "since": f"{since} ago" if since else "",
+            "where": robot.where(areas, levels),
+            "remarks": ", ".join(remarks(robot)),
+            "map": str(robot.status.version or "none"),
+            "cpu": f"{cpu_ms:.1f} ms" if isinstance(cpu_ms, int | float) else "",
+            "failures": str(day.failures.events + day.failures_running),
+            "dropped": share(day.frame_drop_share) or "",
+        }
+        rows.append((robot, day, words | {"exact": exact, "to": context.to(f"robots/{robot.name}")}))
+    return rows
+
+
+def _listed(row: Row, alert: Incident | None = None) -> dict[str, object]:
+    """A robot in the list beside the map. alert: of the robot."""
+    robot, day, words = row
+    failures, suspected = int(words["failures"]), day.silent_estimated.events
+    told = [
+        words["remarks"],
+        f"{alert.assignee} has it" if alert is not None and alert.assignee else "",
+        f"{failures} failure{'s' * (failures > 1)} in 24 h" if failures else "",
+        f"suspected failures: {suspected}" if suspected else "",
+    ]
+    since, exact = ("", "") if robot.tone == "good" else (words["since"], words["exact"])
     return {
         "name": robot.name,
-        "to": context.to(f"robots/{robot.name}"),
+        "to": words["to"],
         "tone": robot.tone,
         "state": robot.words,
-        "since": since,
+        "since": since if robot.tone == "quiet" else since.removesuffix(" ago"),
         "exact": exact,
-        "about": " · ".join(filter(None, [robot.where(areas, levels), ", ".join(words)])),
+        "about": " · ".join(filter(None, [words["where"], ", ".join(filter(None, told))])),
         "place": robot.place_m,
         "incident": alert,
     }
 
 
-def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
+def robots(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template of all robots needs: state and columns are kept in the address."""
+    find, state, hidden = (context.query.get(name, "") for name in ("find", "state", "without"))
+    without = dict.fromkeys(filter(None, hidden.split(",")))
+    if unknown := without.keys() - _COLUMNS.keys():
+        raise UsageError(f"there is no column {min(unknown)[:40]!r}; without names some of {', '.join(_COLUMNS)}")
+    rows = sorted(_rows(services, context), key=lambda row: (ORDER.get(row[0].tone, 1), not row[2]["remarks"]))
+    counts = Counter(robot.words for robot, *_ in rows)
+    if state:
+        counts[state] += 0
+
+    def to(**changed: str) -> str:
+        return context.to("robots", **{"find": find, "state": state, "without": ",".join(without)} | changed)
+
+    shown = [row for row in rows if state in ("", row[0].words)]
+    columns = {name: words for name, words in _COLUMNS.items() if name not in without}
+    states = [
+        (f"{words} ({n})", words == state, to(state="" if words == state else words)) for words, n in counts.items()
+    ]
+    return {
+        "line": site_line(services.robots.look(context.site)),
+        "states": states,
+        "columns": [
+            (words, name in columns, to(without=",".join(without.keys() ^ {name}))) for name, words in _COLUMNS.items()
+        ],
+        "names": {name: words for name, words in columns.items() if any(cells[name] for *_, cells in shown)},
+        "rows": shown,
+        "can_enrol": not cannot_enrol(RobotRegister(services.maps.store)),
+    }
+
+
+def _marks(context: PageContext, live: Sequence[LiveRobot]) -> list[Mark]:
     """Robots that ever sent a position, those in trouble on top."""
-    return [mark for robot in reversed(live.robots) for mark in robot.marks(context.to(f"robots/{robot.name}"))]
+    return [mark for robot in reversed(live) for mark in robot.marks(context.to(f"robots/{robot.name}"))]
 
 
-def _figures(live: LiveSite, health: SiteHealth) -> list[Figure]:
+def _figures(live: Sequence[LiveRobot], health: SiteHealth) -> list[Figure]:
     """Those that are known: what cannot be known yet is left out."""
-    online, failures = len(live.robots) - live.count("quiet"), health.day.failures
-    found = [Figure("Online", f"{online} of {len(live.robots)}", "")] if live.robots else []
+    online, failures = sum(robot.tone != "quiet" for robot in live), health.day.failures
+    found = [Figure("Online", f"{online} of {len(live)}", "")] if live else []
     if shown := share(health.day.localised_share_of_all):
         found.append(Figure("Localised while driving, 24 h", shown, ""))
     if failures.low is not None:
@@ -204,6 +261,7 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[Figure]:
 def _notices(services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]) -> list[Notice]:
     """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
     store, site, found = services.maps.store, context.site, list[Notice]()
+    context = replace(context, query={})  # what is so now is not shown in the time that was chosen on another page
 
     def told(tone: str, words: str, page: str, incident: Incident | None = None) -> None:
         found.append(Notice(tone, words, context.to(page), begun(page), incident))
@@ -212,9 +270,10 @@ def _notices(services: Services, context: PageContext, health: SiteHealth, alert
         if other != site:
             to, more = context.to("", site=other), f"Overview of {other}"
             found.append(Notice("bad", f"Robots of {other} that are not localised: {count}.", to, more))
-    for one in (one for one in alerts if one.name in _ALERTS):
+    # those of robots and trials have words of their own
+    for one in (one for one in alerts if not page_of(one).startswith(("robots/", "trends"))):
         words = f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}"
-        told("bad" if one.state == "open" else "quiet", words, _ALERTS[one.name], one)
+        told("bad" if one.state == "open" else "quiet", words, page_of(one), one)
     versions = store.releases(site).versions if services.maps.is_mapped(site) else {}
     newest = next(reversed(versions.values()), None)
     if newest is not None and newest.state == "draft":
@@ -245,7 +304,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
         Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
     ]
-    cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
+    cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live)
     begin_ns = span_ns[0] or (span_ns[1] or time.time_ns()) - DAYS_SHOWN * 24 * HOUR_NS
     end_ns = span_ns[1] or max(time.time_ns(), begin_ns + 1)
     for least_h in (1, 6, 24):  # until most bars tell something
@@ -261,7 +320,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "is_chosen": span_ns != EVER,
         "has_areas": has_areas,
         "outside": OUTSIDE,
-        "since": context.written(span_ns[0] or health.week_since_ns),
+        "since": context.written(span_ns[0] or hours_within(*span_ns, time.time_ns(), WEEK_H)[0] * HOUR_NS),
         "bars_over_time": Bars("Failures per robot-day", _bars(context, edges, rates), (edges[0], edges[-1])),
         "step": step,
         "cameras": cameras,

@@ -166,7 +166,7 @@ def curve(rows: Sequence[TraceRow], name: str, shown: tuple[int, int]) -> tuple[
 
 def page(services: Services, context: PageContext, robot: str) -> dict[str, object]:
     """What the template needs. UsageError for an unknown robot."""
-    live = services.robots.look(context.site).robot(robot)
+    live = services.robots.robot(context.site, robot)
     if live is None:
         raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
     (since_ns, end_ns), now_ns, ingest = context.time_range(), time.time_ns(), services.settings.config.ingest
@@ -221,7 +221,7 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
 
 def now(services: Services, context: PageContext, robot: str) -> dict[str, object]:
     """What changes from second to second."""
-    live = services.robots.look(context.site).robot(robot)
+    live = services.robots.robot(context.site, robot)
     if live is None:
         return {"line": Sentence("quiet", "It is not known any more."), "facts": [], "marks": [], "incident": None}
     where = live.where(services.maps.store.areas(context.site), services.maps.levels(context.site))

@@ -1,6 +1,7 @@
 """The shift leader's page: one HTML file without links, made of the parts of the page of trends, light or dark as the screen is."""
 
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from markupsafe import Markup
@@ -21,6 +22,7 @@ _BARS = 24
 _SHOWN_FAILURES = 50
 _UNKNOWN = "not known"
 _USUAL = MapserverConfig()
+_moment = partial(moment_text, zone=None)  # by the clock of the machine that writes the page
 
 
 def html_page(store: MapStore, site: str, hours: int, now_ns: int, config: MapserverConfig = _USUAL) -> str:
@@ -58,11 +60,6 @@ def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str,
     """The figures of each key, the worst first."""
     rows = [(key, kpis(counts)) for key, counts in store.fleet.counters_of(site, axis, since).items()]
     return sorted(rows, key=lambda row: (-row[1].failures.events, -row[1].silent_estimated.events, row[0]))
-
-
-def _moment(stamp_ns: int | None) -> str | None:
-    """By the clock of the machine that writes the page."""
-    return moment_text(stamp_ns, None)
 
 
 def _figures(total: Kpis, before: Kpis) -> list[Figure]:

@@ -93,7 +93,9 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is not None:
         context = replace(context, site=chosen.site)  # whatever site the address names, or none
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
-    chosen = chosen or next((job for job in jobs if job.state != "running" and _did_something(job)), None)
+    if chosen is None:  # the last in which a recording was built or refused: a night in which all of them wait was none
+        ended = (job for job in jobs if job.state != "running")
+        chosen = next((job for job in ended if any(row.result != _WAITS for row in _recordings(job))), None)
     inbox = services.maps.inbox_of(context.site)
     held = () if inbox is None else with_acts(services.maps.store, of_inbox(inbox))
     shown: dict[str, object] = {
@@ -109,11 +111,6 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is None:
         return shown
     return shown | _loops(services, context, builds_of(chosen.report)[-1]) | {"recordings": _recordings(chosen)}
-
-
-def _did_something(job: JobInfo) -> bool:
-    """Whether a recording was built or refused in it: a night in which all of them wait was none."""
-    return any(row.result != _WAITS for row in _recordings(job))
 
 
 def _progress(job: JobInfo) -> dict[str, object] | None:

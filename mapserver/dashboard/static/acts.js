@@ -5,6 +5,8 @@
 // data-each: a request for each row that is chosen in the table of the page; "*" in address and body is the row's.
 // data-needs-reason: without a reason nothing is sent. data-lacks: set by a page while something is missing; the dialog then says that instead.
 // Events: `asked` as the dialog opens, where a page may set `send` of the button to make another request; `acted` once it is done.
+import { coded, refusal } from "./stream.js";
+
 const dialog = document.createElement("dialog");
 dialog.className = "ask-box";
 dialog.innerHTML = `<form><h2></h2><p></p>
@@ -21,7 +23,10 @@ const [confirm, refuse] = form.querySelectorAll("button");
 const isNamed = document.body.dataset.named === "true";
 let asked, rows;
 
-const say = (words, tone) => ((notice.textContent = words), (notice.hidden = !words), (notice.className = `notice ${tone}`));
+function say(words, tone) {
+  notice.replaceChildren(...coded(words));
+  Object.assign(notice, { hidden: !words, className: `notice ${tone}` });
+}
 
 const chosenRows = () => [...document.querySelectorAll("tr:not([hidden]) [name=chosen]:checked")];
 
@@ -40,7 +45,8 @@ document.addEventListener("click", ({ target }) => {
   rows = each === undefined ? [undefined] : chosenRows();
   const lacks = rows.length ? button.dataset.lacks : "Choose rows of the table first.";
   const names = each === undefined ? "" : `${rows.map(({ value }) => value).join(", ")}: `;
-  [title.textContent, explanation.textContent] = [`${words}?`, lacks || `${names}${button.dataset.explains}`];
+  title.textContent = `${words}?`;
+  explanation.replaceChildren(...coded(lacks || `${names}${button.dataset.explains}`));
   confirm.textContent = `Yes: ${words}`;
   refuse.textContent = "No, change nothing";
   confirm.hidden = confirm.disabled = Boolean(lacks);
@@ -76,10 +82,10 @@ form.addEventListener("submit", async (event) => {
     act.dispatchEvent(new Event("acted", { bubbles: true }));
     return act.dataset.tells === undefined && location.reload();
   }
-  const found = await answer?.json().catch(() => undefined);
+  const why = await refusal(answer);
   if (asked !== act) return; // a browser may close the dialog all the same
   rows = rows.filter((row) => !row || row.checked);
-  say(found?.detail ?? "The server does not answer; try again.", "bad");
+  say(why, "bad");
 });
 
 function given() {

@@ -1,6 +1,7 @@
 // Points of a floor plan and the same of the map: a click in either is half of one, in any order. They are also a text.
 // What the server makes of them is told at once; it is kept by the act, with the picture.
 import { SiteMap } from "./map/index.js";
+import { coded, refusal } from "./stream.js";
 
 const LAYER = "Outline that you draw";
 const [map, aligning] = ["map", "aligning"].map((id) => document.getElementById(id));
@@ -33,9 +34,9 @@ function begin() {
     if (pins.filter(isWhole).length < 2) return;
     const now = (asked = query().toString());
     const answer = await fetch(`${to}/estimate?${now}`).catch(() => undefined);
-    const found = await answer?.json().catch(() => undefined);
+    const found = answer?.ok ? await answer.json() : await refusal(answer);
     if (asked !== now) return;
-    if (!answer?.ok) return (told.textContent = found?.detail ?? "The server does not answer.");
+    if (!answer?.ok) return told.replaceChildren(...coded(found));
     const left = Object.entries(found.off_m).map(([name, off]) => `${name}: ${off.toFixed(2)} m`).join(", ");
     const checked = found.is_checked ? "" : " Two points fit always: a third would show a mistake.";
     told.textContent = `${found.metres_per_unit.toPrecision(3)} m for each pixel. Left at the points: ${left}.${checked} ${told.textContent}`;

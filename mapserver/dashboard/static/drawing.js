@@ -90,8 +90,8 @@ document.addEventListener("asked", ({ target }) => {
   const { kind, lift, mask, percent, correction, reason } = document.querySelector("dialog form").elements;
   if (!mask) return;
   const follow = () => {
-    lift.required = !(lift.parentElement.hidden = !kind.value);
-    percent.required = !(percent.parentElement.hidden = mask.value !== "speed");
+    lift.disabled = lift.parentElement.hidden = !kind.value; // what is hidden is not checked
+    percent.disabled = percent.parentElement.hidden = mask.value !== "speed";
     reason.required = Boolean(correction.value) && correction.value !== target.dataset.correction;
   };
   for (const field of [kind, mask, correction]) field.addEventListener("change", follow);

@@ -9,6 +9,8 @@ document.getElementById("theme").addEventListener("change", ({ target }) => {
 for (const kind of ["click", "keydown"])
   document.addEventListener(kind, ({ target, key }) => {
     const range = document.querySelector(".range[open]");
-    if (range && (key ? key === "Escape" : !range.contains(target))) range.open = false;
+    if (!range || (key ? key !== "Escape" : range.contains(target))) return;
+    if (key && range.contains(target)) range.firstElementChild.focus();
+    range.open = false;
   });
 document.querySelector("header select[name=site]").addEventListener("change", ({ target }) => target.form.submit());

@@ -6,7 +6,7 @@ function morph(node, other) {
   if (node.isEqualNode(other) && !isTemplate) return;
   if (node.nodeName !== other.nodeName || node.nodeType !== Node.ELEMENT_NODE || isTemplate) return node.replaceWith(other);
   for (const { name } of [...node.attributes]) if (!other.hasAttribute(name) && name !== "open") node.removeAttribute(name);
-  for (const { name, value } of other.attributes) if (node.getAttribute(name) !== value) node.setAttribute(name, value);
+  for (const { name, value } of other.attributes) if (name !== "open" && node.getAttribute(name) !== value) node.setAttribute(name, value);
   morphChildren(node, other);
 }
 

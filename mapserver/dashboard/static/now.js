@@ -6,7 +6,12 @@ import { follow } from "./stream.js";
 const NEAR_ZOOM = 5;
 const map = document.getElementById("map")?.map;
 
-function take({ html, marks }) {
+let told;
+
+function take(news) {
+  told = news;
+  if (document.querySelector("dialog[open]")) return; // its button says what is acted on: it must not become another one
+  const { html, marks } = news;
   const fresh = new DOMParser().parseFromString(html, "text/html");
   renewParts(fresh, [...fresh.body.children].map(({ id }) => document.getElementById(id)));
   map?.show("Robots", marks);
@@ -17,7 +22,5 @@ document.getElementById("robots")?.addEventListener("click", ({ target }) => {
   const place = target.closest("a, button") ? undefined : target.closest("li").dataset.place;
   if (place) map?.map.setView(JSON.parse(place), NEAR_ZOOM);
 });
-follow(document.querySelector("[data-stream]").dataset.stream, take, () => {
-  const line = document.getElementById("line");
-  Object.assign(line, { textContent: "The server does not answer; trying again.", className: `${line.classList[0]} bad` });
-});
+document.addEventListener("close", () => told && take(told), true);
+follow(document.querySelector("[data-stream]").dataset.stream, take);

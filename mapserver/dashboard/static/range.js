@@ -26,6 +26,7 @@ addEventListener("pointerup", ({ clientX }) => {
     const [first, last] = ends(clientX).map((px) => (Number(since) + ((px - left) / width) * (until - since)) / MINUTE_MS);
     for (const [name, minute] of [["since", Math.floor(first)], ["until", Math.ceil(last)]])
       address.searchParams.set(name, `${new Date(minute * MINUTE_MS).toISOString().slice(0, 16)}Z`);
+    for (const name of ["older", "job"]) address.searchParams.delete(name); // what is chosen in a range is perhaps not in another one
     location.assign(address);
   }
   end();

@@ -18,7 +18,11 @@ function renewMap(element, scene) {
   });
 }
 
-export async function renew() {
+// One request at a time: of two the earlier answer could come last.
+let underWay;
+export const renew = () => (underWay ??= renewNow().finally(() => (underWay = undefined)));
+
+async function renewNow() {
   const asked = location.href;
   const answer = await loaded(tag);
   if (document.querySelector("dialog[open]") || asked !== location.href) return; // somebody acts, or wants something else

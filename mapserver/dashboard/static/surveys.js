@@ -1,5 +1,6 @@
 // Recordings are uploaded one after another, and the log of a job is followed while it is open.
 import { renew } from "./renew.js";
+import { coded, refusal } from "./stream.js";
 
 const LOG_MS = 5000;
 const [drop, form, list, log] = ["drop", "upload", "uploads", "log"].map((id) => document.getElementById(id));
@@ -16,11 +17,8 @@ async function put(file, query, row) {
   request.send(file);
   if ((await ended).type === "abort") return "Stopped; nothing was kept.";
   if (!request.status) return "The connection broke, nothing was kept; upload it again.";
-  try {
-    return request.status === 201 ? "" : JSON.parse(request.responseText).detail;
-  } catch {
-    return `The server refused it (${request.status}).`; // a proxy before it did
-  }
+  const unknown = `The server refused it (${request.status}).`; // or a proxy before it did
+  return request.status === 201 ? "" : refusal(new Response(request.response), unknown);
 }
 
 async function upload(files, query) {
@@ -37,10 +35,10 @@ async function upload(files, query) {
   list.append(...rows);
   for (const [n, row] of rows.entries()) {
     if (!row.isConnected) continue;
-    const refusal = await put(files[n], query, row);
-    row.replaceChildren(row.firstChild, ` ${refusal}`);
+    const why = await put(files[n], query, row);
+    row.replaceChildren(row.firstChild, " ", ...coded(why));
     row.className = "bad";
-    if (!refusal) row.remove();
+    if (!why) row.remove();
     await renew();
   }
   isUploading = false;
@@ -69,7 +67,7 @@ if (log) {
     if (before === "running" && state() !== "running" && !isUploading) return location.reload(); // its recordings are known now
     if (!log.open || document.hidden) return;
     const answer = await fetch(log.dataset.log, { headers: { "Fleetmap-Renewal": "1" } }).catch(() => undefined);
-    const text = answer?.ok ? await answer.text() : ((await answer?.json().catch(() => undefined))?.detail ?? "");
+    const text = answer?.ok ? await answer.text() : await refusal(answer);
     const shown = log.querySelector("pre");
     const isAtEnd = shown.scrollTop + shown.clientHeight > shown.scrollHeight - 40;
     if (shown.textContent === text) return;

@@ -46,12 +46,19 @@ function sortBy(head) {
   arrangeTable(table);
 }
 
+// A file says when, and not how long ago.
+function exact(cell) {
+  const copy = cell.cloneNode(true);
+  for (const time of copy.querySelectorAll("time")) time.textContent = time.title;
+  return words(copy);
+}
+
 // Robots and people choose their words: none begins a formula of a spreadsheet.
 const field = (text) => `"${/^[=@]|^[+-](?![\d.]+[ %°a-z/]{0,6}$)/.test(text) ? "'" : ""}${text.replaceAll('"', '""')}"`;
 
 function save(table) {
   const rows = [...table.rows].filter(({ hidden }) => !hidden);
-  const lines = rows.map(({ cells }) => [...cells].filter((cell) => !cell.matches(".choose")).map((cell) => field(words(cell))).join(","));
+  const lines = rows.map(({ cells }) => [...cells].filter((cell) => !cell.matches(".choose")).map((cell) => field(exact(cell))).join(","));
   const href = URL.createObjectURL(new Blob([`${lines.join("\r\n")}\r\n`], { type: "text/csv" }));
   made("a", { href, download: `${table.ariaLabel}.csv` }).click();
 }

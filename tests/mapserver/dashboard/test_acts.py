@@ -19,7 +19,8 @@ from mapserver import releases
 from mapserver.cli import app
 from mapserver.fleet.building import ask_for_survey, end_request, keep_areas
 from mapserver.fleet.fleet import Fleet
-from mapserver.store import Actor, DraftContent, MapStore
+from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.store import Actor, DraftContent, FleetBatch, MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
@@ -178,6 +179,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
             page.get_by_role("button", name="Change aisle <5>").click()
         expect(dialog.get_by_label("Name of the area")).to_have_value("aisle <5>")
         renamed = {"Name of the area": "aisle 5", "For planners": "no effect"}
+        fill(page, {"For planners": "drive slower", "Percent": "0"})  # what is hidden then is not checked
         fill(page, renamed | {"Your name": "ada"})
         found = store.areas(SITE).geojson(SITE)
         shape = {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]}
@@ -236,6 +238,10 @@ def test_a_recording_is_uploaded_built_and_tried_again(page: Page, tmp_path: Pat
         form.get_by_role("button", name="Upload", exact=True).click()
         expect(waiting.get_by_role("listitem").filter(has_text="mon day.mcap")).to_contain_text("20.0 MB")
         expect(uploads.get_by_role("listitem")).to_have_text(re.compile("notes.txt .*is an invalid name of a rec"))
+        page.route("**/inbox/other.mcap?*", lambda route: route.fulfill(status=413, json={"message": "too large"}))
+        page.locator("#upload [type=file]").set_input_files({"name": "other.mcap", "mimeType": "", "buffer": b"1"})
+        form.get_by_role("button", name="Upload", exact=True).click()
+        expect(uploads.get_by_role("listitem").last).to_have_text("other.mcap The server refused it (413).")
         assert (inbox / SITE / chosen.name).stat().st_size == 20_000_000
         expect(waiting).to_contain_text("ready", timeout=15_000)
         change(page, "Build now")
@@ -253,7 +259,7 @@ def test_a_recording_is_uploaded_built_and_tried_again(page: Page, tmp_path: Pat
         with MapStore.open(store) as maps:
             kinds = [(event.kind, event.actor) for event in maps.log(site=SITE, limit=3)]
         assert kinds == [(kind, "ada") for kind in ("recording_tried_again", "build_started", "recording_uploaded")]
-        seen.refused(422, 409)
+        seen.refused(422, 413, 409)
 
 
 def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> None:
@@ -320,6 +326,39 @@ def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, 
     expect(trial).to_contain_text("It fails more often than the margin allows")
 
 
+def test_an_act_stays_with_what_it_was_begun_for(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        store.update_job(store.begin_job(SITE, "nightly"), "failed", "see `mapserver doctor`", {"waiting": []})
+    with serving(tmp_path) as served, MapStore.open(tmp_path) as store:
+        seen, dialog = opened(page, served, "", since="2026-01-01"), page.get_by_role("dialog")
+        notices = page.locator("#notices p")
+        expect(notices.first).to_contain_text("The night of hall failed")
+        expect(notices.first.locator("code")).to_have_text("mapserver doctor")
+        expect(notices.first.get_by_role("link")).not_to_have_attribute("href", re.compile("since"))
+        notices.first.get_by_role("button", name="Acknowledge").click()
+        hour, batch = hour_of(store.now_ns()), FleetBatch()
+        driven_ms = 1_000_000_000
+        batch.add(
+            SITE,
+            "site",
+            "",
+            hour,
+            Counters(driving_ms=driven_ms, judged_ms=driven_ms, failures=999, blind_failures=999),
+        )
+        store.fleet.add(batch)  # another alert takes its place on the page
+        page.wait_for_timeout(8000)
+        agree(page, {"Your name": "ada"})
+        expect(notices.first).to_contain_text("robots of hall failed", ignore_case=True)
+        expect(notices.nth(1)).to_contain_text("ada has it.")
+        notices.first.get_by_role("button", name="Acknowledge").click()
+        faster = {"incident": f"FleetmapFailureRate/{SITE}", "actor": "bob"}
+        httpx.post(f"{served.http}/v1/incidents/acknowledge", json=faster).raise_for_status()
+        agree(page, {"Your name": "ada"})
+        expect(dialog.get_by_role("alert").locator("code")).to_have_text("incidents list")
+        seen.refused(409)
+
+
 def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -> None:
     fill_store(tmp_path)
     with MapStore.open(tmp_path) as store:
@@ -347,10 +386,12 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
     with serving(tmp_path, "--zenoh", "tls/127.0.0.1:0") as served:
         seen, dialog = opened(page, served, "administration/people"), page.get_by_role("dialog")
         expect(page.get_by_text("Nobody signs in yet")).to_be_visible()
-        ask("Add an operator", name="carl", Name="bob")
-        roles = dialog.get_by_label("Role").locator("option").all_inner_texts()
-        assert roles == ["admin: everything, people and robots, too"]
-        password = told()
+        with httpx.stream("GET", f"{served.http}/dashboard/now?site={SITE}", timeout=60) as stream:
+            ask("Add an operator", name="carl", Name="bob")
+            roles = dialog.get_by_label("Role").locator("option").all_inner_texts()
+            assert roles == ["admin: everything, people and robots, too"]
+            password = told()
+            assert "event: ended" in stream.iter_lines(), "nobody follows without signing in any more"
         page.keyboard.press("Escape")
         expect(dialog).to_contain_text("is shown only now")
         dialog.get_by_role("button", name="Close").click()

@@ -50,6 +50,20 @@ def test_everything_is_reached_with_the_keyboard_alone(page: Page, small_fleet: 
     tab_to(page, "Theme")
     page.keyboard.press("ArrowDown")
     assert page.evaluate("document.body.className") == "console "
+    tab_to(page, "Map of hall")
+    for _ in range(20):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(600)
+    moved = marks(page)[0]["page"]
+    page.wait_for_timeout(2500)
+    assert marks(page)[0]["page"] == moved, "the map stays where it was moved to, and does not follow the robot"
+
+    enter(page, "Trends", "Trends of hall")
+    tab_to(page, "Last 24 h")
+    for key in ("Enter", "Tab", "Escape"):
+        page.keyboard.press(key)
+    assert page.evaluate(_FOCUS)[0] == "Last 24 h"
+    expect(page.get_by_label("Until")).to_be_hidden()
 
     enter(page, "Robots", "Robots of hall")
     assert page.evaluate("document.body.className") == "console ", "the look that was chosen stays"

@@ -260,10 +260,11 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
         store.tell_progress(new, {"stage": "odometry", "done": 1, "total": 10, "stage_s": 1.0})
         of_yard = httpx.get(f"{served.http}/dashboard/surveys?site=hall&job={new}", timeout=60).text
         assert "Surveys of yard" in of_yard, "a job is on the map of its own site"
+        assert 'href="/dashboard/map?site=yard"' in of_yard
         opened(page, served, "surveys", site="yard")
         expect(jobs).to_contain_text("odometry: 1 of 10")
-        store.update_job(new, "failed", "no frames", {})
-        expect(jobs).to_contain_text("no frames", timeout=15_000)
+        store.update_job(new, "failed", "no frames; `mapserver doctor` says more", {})
+        expect(jobs.locator("code")).to_have_text("mapserver doctor", timeout=15_000)
 
 
 def test_a_time_is_dragged_in_a_chart_and_kept_on_other_pages(page: Page, served: Served) -> None:
@@ -403,17 +404,24 @@ def test_a_refused_stream_is_opened_again_and_a_hidden_page_has_none(page: Page,
     )
     page.route("**/now?*", lambda route: route.fulfill(status=502))
     seen = opened(page, served, "")
-    line = page.locator("#line")
-    expect(line).to_have_text("The server does not answer; trying again.")
+    silent = page.get_by_text("The server does not answer; trying again.")
+    expect(silent).to_be_visible()
     page.unroute("**/now?*")
     seen.refused(502)
-    expect(line).to_contain_text("robots")
+    expect(silent).to_be_hidden()
     turned = "on => { Object.defineProperty(document, 'hidden', { value: on, configurable: true });"
     turned += "document.dispatchEvent(new Event('visibilitychange')); }"
     page.evaluate(turned, True)
     assert page.evaluate("streams.every(stream => stream.readyState === 2)")
     page.evaluate(turned, False)
     wait_until(page, "() => streams.at(-1).readyState === 1")
+    opened(page, served, "failures")  # of a site that the server chose
+    page.route("**/failures?site=hall", lambda route: route.fulfill(status=502))
+    expect(silent).to_be_visible(timeout=15_000)
+    page.unroute("**/failures?site=hall")
+    expect(silent).to_be_hidden(timeout=15_000)
+    assert {fault[:3] for fault in seen.faults if fault[0] != "F"} == {"502"}
+    seen.faults.clear()
 
 
 def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -> None:

@@ -255,7 +255,7 @@ def test_many_pages_look_once(store: MapStore) -> None:
 
     fleet, now = Counting(store), [0.0]
     live = LiveRobots(fleet, lambda: now[0])
-    assert [robot.name for robot in live.look(SITE).robots] == ["b", "a"]
+    assert [robot.name for robot in live.look(SITE)] == ["b", "a"]
     live.look(SITE)
     assert fleet.looked == 1
     now[0] = 1.0

@@ -11,11 +11,12 @@ from playwright.sync_api import Locator, Page, expect
 
 from mapserver import releases
 from mapserver.fleet.building import ask_for_survey
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, MapStore
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking
 from support.pages.browser import Chromium, agree, box_of
-from support.storage.operator_scene import WORSE, fill_shift, yesterday
+from support.storage.operator_scene import WORSE, failed_at, fill_shift, yesterday
 
 MOST_CLICKS = 2
 
@@ -81,6 +82,11 @@ def test_names_of_robots_keep_off_those_of_areas(page: Page, served: Served, siz
     assert len(names) >= 6
     assert overlapping(names) == []
     assert overlapping(names, areas) == []
+    opened(page, served, "map")  # areas are in sight as wholes, also where they are larger than what was surveyed
+    around = box_of(page.locator(".site-map"))
+    for area in map(box_of, page.locator(".site-map path.area").all()):
+        assert around["y"] <= area["y"]
+        assert area["y"] + area["height"] <= around["y"] + around["height"]
 
 
 def test_which_robots_need_a_person_now(operator: Operator) -> None:
@@ -125,6 +131,9 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     operator.click(table.get_by_role("link", name="aisle 2"))
     expect(page.locator("h1")).to_have_text("Failures of hall")
     listed_in(page, "aisle 2")
+    opened(page, operator.served, "trends", until=f"{datetime.fromtimestamp(yesterday(12, 0) / 1e9, UTC):%Y-%m-%d}")
+    page.get_by_role("link", name="aisle 2").click()
+    expect(page.locator("h1")).to_have_text("Failures of hall")
 
 
 def test_what_happened_last(operator: Operator) -> None:
@@ -147,14 +156,14 @@ def test_what_happened_last(operator: Operator) -> None:
 
 def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
     page = operator.page
-    operator.click(page.get_by_role("link", name="Area by area"))
-    week = page.get_by_role("table", name="What got worse this week")
-    operator.click(week.get_by_role("link", name="aisle 2"))
-    operator.clicks = 0
+    with MapStore.open(operator.served.folder) as store:
+        report = failed_at("tug-6", "today", store.now_ns(), (30.0, 14.0), cause="no_match")
+        assert not Fleet(store).take_failure(SITE, "tug-6", report).refused
+    operator.go("Failures")
+    operator.click(page.get_by_role("list", name="Area").get_by_role("link", name=re.compile(r"^aisle 2: \d today")))
     chosen = page.get_by_role("list", name="Area").locator(".chosen")
-    operator.click(page.locator(".range summary"))
-    operator.click(page.get_by_role("link", name="Today", exact=True))
     expect(chosen).to_contain_text("aisle 2")
+    expect(page.get_by_role("list", name="Failures").get_by_role("listitem").first).to_contain_text("tug-6")
     expect(page.locator(".range [name=since]")).to_have_value(re.compile(r"^\d{4}-\d\d-\d\dT00:00$"))
     operator.clicks = 0
     operator.click(page.get_by_role("list", name="Area").get_by_role("link", name="aisle 1"))

@@ -96,7 +96,8 @@ def _weeks(now_ns: int) -> FleetBatch:
     return batch
 
 
-def _report(robot: str, name: str, at_ns: int, place_m: tuple[float, float], **changes: object) -> FailureReport:
+def failed_at(robot: str, name: str, at_ns: int, place_m: tuple[float, float], **changes: object) -> FailureReport:
+    """A failure that began then, and there."""
     made = failure(robot, name, wall_ns=at_ns)
     at = Placement.of(se3(np.eye(3), np.array([*place_m, 0.0])))
     tile = (int(place_m[0] // 16), int(place_m[1] // 16))
@@ -113,9 +114,9 @@ def _failures(store: MapStore, folder: Path) -> None:
     for n in range(14):
         at_ns = store.now_ns() - int(rng.uniform(1, 160) * 3600) * 1_000_000_000
         place = (float(rng.uniform(20, 40)), 14.0) if n % 3 else (float(rng.uniform(10, 55)), 6.0 + 16.0 * (n % 2))
-        report = _report(f"tug-{n % 8}", f"some-{n}", at_ns, place, cause="no_match")
+        report = failed_at(f"tug-{n % 8}", f"some-{n}", at_ns, place, cause="no_match")
         assert not fleet.take_failure(SITE, report.robot, report).refused
-    carried = _report(
+    carried = failed_at(
         "tug-7", "carried", yesterday(14, 3), (20.0, 14.0), cause="carried", wrong_by_m=5.0, camera=camera
     )
     assert not fleet.take_failure(SITE, "tug-7", carried).refused

@@ -1,7 +1,7 @@
 // The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports. Each is drawn
 // from what its element says; a click is its event `pick`, with x and y in metres and the mark that is there, unless that leads to a page.
 import * as L from "../vendor/leaflet/leaflet.js";
-import { Axes, Marks, MarkSet, Switch, words } from "./marks.js";
+import { Axes, Marks, MarkSet, words } from "./marks.js";
 
 const POINTS_PER_NAME_PX = 7;
 const FIT = { padding: [6, 6], animate: false };
@@ -50,7 +50,7 @@ export class SiteMap {
     this.bounds = L.latLngBounds(corners(scene.box));
     map.fitBounds(this.bounds, FIT);
     const marks = new Marks();
-    if (scene.hasAxes !== false) map.addLayer(new Axes());
+    if (scene.hasAxes !== false) map.addLayer((this.axes = new Axes()));
     map.addLayer(marks);
     map.on("click", ({ containerPoint, latlng }) => {
       const mark = marks.nearest(containerPoint)?.item;
@@ -62,21 +62,21 @@ export class SiteMap {
     for (const { name, items, shown } of scene.layers) {
       const group = (this.layers[name] = L.layerGroup());
       group.marks = new MarkSet(marks);
-      group.addLayer(new Switch(group.marks, "isShown"));
+      group.marks.with(group, "isShown");
       if (shown) group.addTo(map);
       chosen[name] = group;
       this.fill(group, items, false);
-      if (name === "Robots") chosen["Trails of the last minute"] = new Switch(group.marks, "hasTrails");
+      if (name === "Robots") chosen["Trails of the last minute"] = group.marks.with(L.layerGroup(), "hasTrails");
     }
     L.control.layers({}, chosen, { collapsed: true }).addTo(map);
-    map.on("zoomend overlayadd", this.nameAreas, this);
+    map.on("zoomend overlayadd overlayremove", this.nameAreas, this);
     this.nameAreas();
     element.addEventListener("wheel", () => (this.touched ||= map.scrollWheelZoom.enabled()), { passive: true });
     this.observer = new ResizeObserver(() => {
       map.invalidateSize({ pan: false });
       if (!this.touched) map.fitBounds(this.bounds, FIT);
     });
-    element.addEventListener("pointerdown", () => (this.touched = true));
+    for (const kind of ["pointerdown", "keydown"]) element.addEventListener(kind, ({ key }) => (this.touched ||= key !== "Tab"));
     this.observer.observe(element);
   }
   remove() {
@@ -84,7 +84,7 @@ export class SiteMap {
     this.map.remove();
   }
   fill(group, items, isMoving) {
-    for (const layer of group.getLayers()) if (!(layer instanceof Switch)) group.removeLayer(layer);
+    group.clearLayers();
     for (const item of items) {
       if (item.kind === "mark") continue;
       const drawn = DRAWN[item.kind](item);
@@ -101,7 +101,7 @@ export class SiteMap {
     const group = this.layers[name];
     if (!group) return; // of a version that was published while the page is open
     this.fill(group, items, isMoving);
-    this.nameAreas();
+    if (items.some(({ kind }) => kind === "area")) this.nameAreas();
     if (this.scene.follows && !this.touched) this.grow(items);
   }
   grow(items) {
@@ -117,6 +117,7 @@ export class SiteMap {
       const hasRoom = high.x - low.x > POINTS_PER_NAME_PX * name.getContent().textContent.length && low.y - high.y > 14;
       name.getElement().style.display = hasRoom ? "" : "none";
     });
+    this.axes?.refresh();
   }
 }
 

@@ -84,6 +84,15 @@ const Painted = L.Layer.extend({
   at(x, y) {
     return [this.origin.x + x * this.scale, this.origin.y - y * this.scale];
   },
+  corner() {
+    const container = this.map.getContainer(), box = container.getBoundingClientRect();
+    return [box.left + container.clientLeft, box.top + container.clientTop];
+  },
+  areaNames() {
+    const [left, top] = this.corner();
+    const boxes = [...this.map.getPane("tooltipPane").querySelectorAll(".area-name")].map((name) => name.getBoundingClientRect());
+    return boxes.filter((box) => box.width > 0).map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top]);
+  },
   write(pen, text, x, y) {
     pen.lineWidth = 3;
     pen.strokeStyle = this.tones.ground;
@@ -92,7 +101,9 @@ const Painted = L.Layer.extend({
   },
 });
 
-// Metres along the lower and the left edge.
+const overlaps = (box, other) => other[0] <= box[2] && box[0] <= other[2] && other[1] <= box[3] && box[1] <= other[3];
+
+// Metres along the lower and the left edge; names of areas are there before figures.
 export const Axes = Painted.extend({
   pane: "overlayPane",
   draw(pen, size) {
@@ -104,7 +115,7 @@ export const Axes = Painted.extend({
     pen.strokeStyle = this.tones.quiet;
     pen.lineWidth = 1;
     pen.beginPath();
-    const names = [];
+    const names = [], taken = this.areaNames();
     for (let n = x, px; (px = this.at(n * step, 0)[0]) < size.x - 20; n++) {
       pen.moveTo(px, size.y), pen.lineTo(px, size.y - 7);
       names.push([(n * step).toFixed(digits), px, size.y - 10, "center"]);
@@ -116,7 +127,11 @@ export const Axes = Painted.extend({
     pen.stroke();
     names.push(["x (m)", size.x - 6, size.y - 24, "right"], ["y (m)", 10, ZOOM_BUTTONS_PX + 8, "left"]);
     pen.fillStyle = this.tones.quiet;
-    for (const [text, px, py, align] of names) (pen.textAlign = align), this.write(pen, text, px, py);
+    for (const [text, px, py, align] of names) {
+      const width = pen.measureText(text).width, left = px - { left: 0, center: width / 2, right: width }[align];
+      pen.textAlign = align;
+      if (!taken.some((name) => overlaps([left, py - 12, left + width, py + 3], name))) this.write(pen, text, px, py);
+    }
   },
 });
 
@@ -215,7 +230,7 @@ export const Marks = Painted.extend({
       mark.width ??= pen.measureText(mark.item.name).width;
       for (const side of mark.side ? [mark.side, ...SIDES] : SIDES) {
         const box = this.nameBox(mark, side);
-        if (obstacles.some((other) => other[0] <= box[2] && box[0] <= other[2] && other[1] <= box[3] && box[1] <= other[3])) continue;
+        if (obstacles.some((other) => overlaps(box, other))) continue;
         mark.side = side;
         taken.push(box);
         return true;
@@ -232,15 +247,6 @@ export const Marks = Painted.extend({
     const [x, y] = this.at(mark.item.x, mark.item.y);
     const [from, to] = left ? [x - 12 - mark.width, x - 6] : [x + 6, x + 12 + mark.width];
     return [from, y + base - 13, to, y + base + 4];
-  },
-  corner() {
-    const container = this.map.getContainer(), box = container.getBoundingClientRect();
-    return [box.left + container.clientLeft, box.top + container.clientTop];
-  },
-  areaNames() {
-    const [left, top] = this.corner();
-    const boxes = [...this.map.getPane("tooltipPane").querySelectorAll(".area-name")].map((name) => name.getBoundingClientRect());
-    return boxes.filter((box) => box.width > 0).map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top]);
   },
   nearest(point) {
     let best, reach = REACH_PX;
@@ -271,12 +277,19 @@ export const Marks = Painted.extend({
   },
 });
 
-// The marks of one layer; they and their trails are shown by a `Switch` each.
+// The marks of one layer.
 export class MarkSet {
   constructor(painter) {
     this.painter = painter;
     this.marks = new Map();
     painter.sets.push(this);
+  }
+  // Shows what `name` says, marks or trails, while a layer is on the map.
+  with(layer, name) {
+    return layer.on("add remove", ({ type }) => {
+      this[name] = type === "add";
+      this.painter.refresh();
+    });
   }
   show(items, isMoving) {
     const still = !isMoving || matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -298,18 +311,3 @@ export class MarkSet {
     this.painter.refresh();
   }
 }
-
-export const Switch = L.Layer.extend({
-  initialize(set, name) {
-    this.turn = (isOn) => {
-      set[name] = isOn;
-      set.painter.refresh();
-    };
-  },
-  onAdd() {
-    this.turn(true);
-  },
-  onRemove() {
-    this.turn(false);
-  },
-});
