@@ -133,13 +133,11 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
             alike = ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
             stay = f"{starts.ambiguous} of {tries} starts stay AMBIGUOUS"
             return Reason(f"{area.name} looks like {alike or 'another place'}: {stay}")
-        return Reason(
-            f"{area.name}: {starts.lost} of {tries} starts without a guess stay lost", f"{area.name}: survey it"
-        )
+        words = f"{area.name}: {starts.lost} of {tries} starts without a guess stay lost"
+        return Reason(words, f"{area.name}: survey it")
 
-    row = _share(
-        "Starts without a guess that find their place", report, settings, lambda area: area.starts.found_of_all, unfound
-    )
+    name = "Starts without a guess that find their place"
+    row = _share(name, report, settings, lambda area: area.starts.found_of_all, unfound)
     if not whole.found_of_all.tries:
         row = row._replace(reasons=[Reason("no start without a guess was tried: record a longer drive")])
     yield row._replace(limit="", reasons=None) if KNOWN_STARTS in report.promises else row
@@ -155,9 +153,8 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
     yield Row("Frames localized while driving", localized, _worst(shares), f"at least {100 * least:g} %", words)
     for name, share in (("median", "median"), ("p99", "99 %")):
         known = _errors((drive.name, (drive.errors_mm or {}).get(name)) for drive in drives)
-        yield Row(
-            f"Error while driving, {share}, of the worst drive", max(known)[2] if known else "not known", _worst(known)
-        )
+        error = max(known)[2] if known else "not known"
+        yield Row(f"Error while driving, {share}, of the worst drive", error, _worst(known))
     silent = [(drive.name, drive.silent) for drive in drives if drive.silent]
     wrong = [(drive, f"{n}", Reason(f"{drive}: {n} silent failures while driving")) for drive, n in silent]
     # Against a drive's own replay nothing is silently wrong.
@@ -166,9 +163,8 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
     failures = [(drive.failures, drive.name, str(drive.failures)) for drive in drives]
     yield Row("Position failures while driving", str(sum(drive.failures for drive in drives)), _worst(failures))
     docks_mm = [off_mm for drive in drives for off_mm in drive.docks_mm]
-    yield Row(
-        "Largest distance at a dock passed", f"{max(docks_mm):.0f} mm, of {len(docks_mm)}" if docks_mm else "none"
-    )
+    furthest = f"{max(docks_mm):.0f} mm, of {len(docks_mm)}" if docks_mm else "none"
+    yield Row("Largest distance at a dock passed", furthest)
 
 
 def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:

@@ -343,15 +343,13 @@ class LiveMap:
 
     def _follow(self, first: int) -> None:
         """Update the chain's edges and the map's poses of the window after adjustment."""
-        start = max(first - 1, 0)
+        start, chain = max(first - 1, 0), np.array(self._chain_from_body)
         del self._chain[start:]
-        for k in range(start, len(self._keyframes) - 1):
-            i_from_j = se3_inverse(self._chain_from_body[k]) @ self._chain_from_body[k + 1]
+        for k in range(start, len(chain) - 1):
+            i_from_j = se3_inverse(chain[k]) @ chain[k + 1]
             self._chain.append(PoseEdge(k, k + 1, i_from_j, self._step_covs[k], is_loop=False))
-        placed = list(self._map_from_body[: start + 1])
-        for edge in self._chain[start:]:
-            placed.append(placed[-1] @ edge.i_from_j)
-        self._map_from_body = np.array(placed)
+        moved = self._map_from_body[start] @ se3_inverse(chain[start]) @ chain[start + 1 :]
+        self._map_from_body = np.concatenate([self._map_from_body[: start + 1], moved])
 
     def _connect(self, first: int) -> None:
         """Assign the newest keyframes to parts, by the same rule as a build."""
