@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import tzinfo
 from itertools import groupby, pairwise
-from math import hypot
+from math import dist
 
 from fleetmap.failure_definition import is_blind, is_usable
 from fleetmap.failure_summary import Moment
@@ -16,7 +16,7 @@ from fleetmap.messages import Cause, FailureReport, Status
 from mapserver.api.moments import clock_text
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, held, tone_of
-from mapserver.dashboard.fleet_health import MANY_FAILURES, NEAR_NS
+from mapserver.dashboard.fleet_health import MANY_FAILURES, NEAR_NS, places_of
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, PictureRow
@@ -180,7 +180,7 @@ def believed_path(moments: Sequence[Moment], clock: FailureClock) -> list[Line]:
         there, here = _place(last), _place(each)
         if there is None or here is None:
             continue
-        step_m, step_s = hypot(here[0] - there[0], here[1] - there[1]), (each.stamp_ns - last.stamp_ns) * 1e-9
+        step_m, step_s = dist(here, there), (each.stamp_ns - last.stamp_ns) * 1e-9
         if step_s > _SILENT_S:
             continue
         if step_m > max(_JUMP_M, _JUMP_MPS * step_s):
@@ -268,9 +268,8 @@ def _nearby(services: Services, row: FailureRow) -> tuple[list[FailureRow], str]
 
 
 def _is_near(row: FailureRow, other: FailureRow) -> bool:
-    if row.x_map_m is None or row.y_map_m is None or other.x_map_m is None or other.y_map_m is None:
-        return False
-    return hypot(other.x_map_m - row.x_map_m, other.y_map_m - row.y_map_m) <= _NEAR_M
+    places = places_of([row, other])
+    return len(places) == 2 and dist(*places) <= _NEAR_M
 
 
 def _facts(context: PageContext, row: FailureRow, report: FailureReport) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ from mapserver.api.incidents import incidents, of_failure
 from mapserver.api.moments import read_moment
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER
-from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
+from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES, places_of
 from mapserver.dashboard.fleet_parts import bar_edges, page_of
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.fleet.alerts import Incident, with_acts
@@ -76,13 +76,11 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     else:
         found = kept_failures.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
     shown = found[:FAILURES_SHOWN]
-    places = [(row.x_map_m, row.y_map_m) for row in matching if row.x_map_m is not None and row.y_map_m is not None]
-    dense = {"Density": places}
+    dense = {"Density": places_of(matching)}
     is_kept = version is not None and services.maps.has_version(context.site, version)
     drawn = version if is_kept else services.maps.current_version(context.site)
     facets = _facets(context, rows, chosen, kept, services.maps.store.areas(context.site).names)
-    settings = services.settings.config.alerts
-    found_open = incidents(maps.store, services.robots.fleet, settings, maps.inbox, context.site)
+    open_ones = incidents(maps.store, services.robots.fleet, services.settings.config.alerts, maps.inbox, context.site)
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
     shades = {cause: min(n, _SHADES - 1) for n, (cause, *_) in enumerate(causes)}
     return {
@@ -102,7 +100,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "rows": shown,
         "held": held(services, shown),
         "incidents": [
-            (one, context.to(page_of(one))) for one in sorted(found_open, key=lambda one: one.state != "open")
+            (one, context.to(page_of(one))) for one in sorted(open_ones, key=lambda one: one.state != "open")
         ],
         "pictures": kept_failures.first_pictures(row.number for row in shown),
         "older": context.to("failures", **kept, older=shown[-1].number) if len(found) > len(shown) else None,

@@ -18,7 +18,7 @@ from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings, TileConcern
-from mapserver.store import FailureFilter, MapStore
+from mapserver.store import FailureFilter, FailureRow, MapStore
 
 _log = logging.getLogger(__name__)
 DAY_H, WEEK_H = 24, 7 * 24
@@ -85,8 +85,7 @@ class HealthData:
         if since_ns is None and until_ns is None:
             since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
         wanted = FailureFilter(site=site, since_ns=since_ns, until_ns=until_ns)
-        found = self._store.fleet.failures(wanted, limit=MANY_FAILURES)
-        return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
+        return places_of(self._store.fleet.failures(wanted, limit=MANY_FAILURES))
 
     def cameras(self, site: str) -> dict[str, CameraNote]:
         """The robots' cameras as the newest failure report of each tells it; robots without one are left out."""
@@ -133,6 +132,11 @@ class HealthData:
         axis = "area" if self._store.areas(site) else "tile"
         spans = (first, end), (first - WEEK_H, first)
         return area_trends(*(self._store.fleet.counters_of(site, axis, *span) for span in spans))
+
+
+def places_of(rows: Iterable[FailureRow]) -> list[tuple[float, float]]:
+    """Where failures began, as far as that is known."""
+    return [(row.x_map_m, row.y_map_m) for row in rows if row.x_map_m is not None and row.y_map_m is not None]
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:

@@ -101,14 +101,10 @@ def _floors(services: Services, context: PageContext) -> tuple[list[Choice], lis
         (f"{level} ({counts[floor]})", floor == site, context.to("", site=floor))
         for floor, level in reversed(levels.items())
     ]
-    guests = []
-    for row in (row for floor in levels for row in _rows(services, replace(context, site=floor))):
-        if row[0].floor == site:
-            named = {
-                "name": f"{row[0].name} of {row[0].status.site}",
-                "about": "on this floor: it tells no position here",
-            }
-            guests.append(_listed(row) | named)
+    homes = sorted({robot.status.site for robot in robots if robot.floor == site})
+    rows = (row for home in homes for row in _rows(services, replace(context, site=home)) if row[0].floor == site)
+    about = "on this floor: it tells no position here"
+    guests = [_listed(row) | {"name": f"{row[0].name} of {row[0].status.site}", "about": about} for row in rows]
     return floors, guests
 
 

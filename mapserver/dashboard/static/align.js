@@ -1,6 +1,6 @@
 // Points of a floor plan and the same of the map: a click in either is half of one, in any order. They are also a text.
 // What the server makes of them is told at once; it is kept by the act, with the picture.
-import { SiteMap } from "./map/index.js";
+import { SiteMap, mark } from "./map/index.js";
 import { coded, refusal } from "./stream.js";
 
 const LAYER = "Outline that you draw";
@@ -16,11 +16,7 @@ function begin() {
   const query = (more = {}) => new URLSearchParams([...pins.filter(isWhole).map(({ plan, map }, n) => ["pin", `${n + 1}=${plan}:${map}`]), ...Object.entries(more)]);
   const isOpen = () => aligning.open && !map.classList.contains("drawing");
   const marks = (side, turn) =>
-    pins.flatMap(({ [side]: place }, n) => {
-      const name = `${n + 1}`;
-      if (!place) return [];
-      return [{ kind: "mark", x: place[0], y: turn * place[1], tone: "accent", shape: "square", words: `point ${name}`, name, heading_rad: null, address: null }];
-    });
+    pins.flatMap(({ [side]: place }, n) => (place ? [mark(place[0], turn * place[1], `point ${n + 1}`, { name: `${n + 1}` })] : []));
   function show() {
     map.map.show(LAYER, marks("map", 1), false);
     plan?.show("Points", marks("plan", -1), false);

@@ -1,5 +1,7 @@
 // An outline drawn on the map, for a survey or a named area, and the areas that are there. While drawing is switched on, each click is a
 // corner, and one on the first corner switches it off; the corners are also a text. They stay when the page is loaded again.
+import { mark } from "./map/index.js";
+
 const LAYER = "Outline that you draw";
 const EXAMPLE = "write x and y in metres, as in 0, 0; 4, 0; 4, 3";
 const [map, drawing] = ["map", "drawing"].map((id) => document.getElementById(id));
@@ -11,7 +13,7 @@ function drawn() {
   function show(lacks = corners.length < 3 && "Draw at least three corners first: switch drawing on and click into the map, or write them.") {
     const isClosed = !isOn.checked && corners.length > 2;
     const side = { kind: "line", points: isClosed ? [...corners, corners[0]] : corners, tone: "accent", width: 2, words: "", hue: null };
-    const ends = corners.map(([x, y], n) => ({ kind: "mark", x, y, tone: "accent", shape: "square", words: `corner ${n + 1}`, name: "", heading_rad: null }));
+    const ends = corners.map(([x, y], n) => mark(x, y, `corner ${n + 1}`));
     map.map.show(LAYER, corners.length > 1 ? [side, ...ends] : ends, false);
     map.classList.toggle("drawing", isOn.checked);
     map.map.map.doubleClickZoom[isOn.checked ? "disable" : "enable"]();
@@ -28,9 +30,9 @@ function drawn() {
     isOn.checked = false;
     change(made);
   }
-  map.addEventListener("pick", ({ detail: { x, y, mark } }) => {
+  map.addEventListener("pick", ({ detail: { x, y, mark: there } }) => {
     if (!isOn.checked) return;
-    if (mark?.words === "corner 1" && corners.length > 2) end(corners);
+    if (there?.words === "corner 1" && corners.length > 2) end(corners);
     else change([...corners, [x, y].map((metres) => Number(metres.toFixed(2)))]);
   });
   text.addEventListener("input", () => {
@@ -66,14 +68,10 @@ const CHANGES = {
   remove: (areas, name) => areas.filter((area) => !isCalled(name)(area)),
 };
 
-async function read(address) {
-  const answer = await fetch(address, { cache: "no-store" });
-  return { answer, areas: answer.ok && (await answer.json()) };
-}
-
 async function send(before, { dataset }, { name, kind, lift, mask, percent, correction, ...by }) {
-  const { answer, areas } = await before;
+  const answer = (await before).clone(); // for another try
   if (!answer.ok) return answer;
+  const areas = await answer.json();
   if (dataset.name && !areas.features.some(isCalled(dataset.name)))
     return new Response(JSON.stringify({ detail: `There is no area ${dataset.name} any more: somebody else changed it.` }), { status: 412 });
   const features = CHANGES[dataset.area](areas.features, dataset.name, { name: name?.trim(), kind, lift, mask, percent, correction, reason: by.reason });
@@ -84,7 +82,7 @@ async function send(before, { dataset }, { name, kind, lift, mask, percent, corr
 
 document.addEventListener("asked", ({ target }) => {
   if (!target.dataset.area || target.dataset.lacks) return;
-  const before = read(target.dataset.act);
+  const before = fetch(target.dataset.act, { cache: "no-store" });
   before.catch(() => {}); // it is told when it is sent
   target.send = (act, told) => send(before, act, told);
   const { kind, lift, mask, percent, correction, reason } = document.querySelector("dialog form").elements;

@@ -1,4 +1,6 @@
 // Steps through the seconds around a failure: picture, state, belief and place of the chosen moment. Words of robots are text here.
+import { mark } from "./map/index.js";
+
 const { instants, pictures } = JSON.parse(document.getElementById("seconds").textContent);
 const [moment, seen, caption, now, when, belief, map] = ["moment", "seen", "seen-when", "now", "when", "belief", "map"].map((id) => document.getElementById(id));
 const address = ([place]) => seen.src.replace(/\d+$/, place);
@@ -12,8 +14,7 @@ function show(chosen_ms) {
     seen.src = address(last);
     caption.textContent = `Left camera image of ${last[1]}`;
   }
-  const mark = { kind: "mark", shape: "circle", address: null, name: "", words: `${clock}: ${words}`, x, y, tone, heading_rad };
-  map?.map?.show("Chosen moment", x === null ? [] : [mark], false);
+  map?.map?.show("Chosen moment", x === null ? [] : [mark(x, y, `${clock}: ${words}`, { shape: "circle", tone, heading_rad })], false);
 }
 
 moment.addEventListener("input", () => show(moment.value));

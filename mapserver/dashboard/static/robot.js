@@ -1,5 +1,5 @@
 // A person's word of where a robot stands.
-import "./map/index.js";
+import { mark } from "./map/index.js";
 
 const element = document.getElementById("map");
 const map = element?.map;
@@ -15,8 +15,8 @@ function choose() {
   button.dataset.lacks = isPlaced ? "" : "Click into the map, or write x and y.";
   button.dataset.explains = `${robot} will search for itself around ${x}, ${y} m, ${facing}. No other robot is changed.`;
   button.dataset.body = JSON.stringify({ x_map_m: x, y_map_m: y, heading_rad: turn });
-  const mark = { kind: "mark", x, y, tone: "accent", shape: turn === null ? "cross" : "arrow", words: "chosen place", address: null, name: "", heading_rad: turn };
-  map.show("Chosen place", isPlaced ? [mark] : [], false);
+  const chosen = mark(x, y, "chosen place", { shape: turn === null ? "cross" : "arrow", heading_rad: turn });
+  map.show("Chosen place", isPlaced ? [chosen] : [], false);
 }
 
 if (place) {

@@ -24,6 +24,9 @@ const DRAWN = {
   },
 };
 
+// What people choose on a map, as map_layers.py tells marks.
+export const mark = (x, y, words, more) => ({ kind: "mark", x, y, words, tone: "accent", shape: "square", name: "", address: null, heading_rad: null, ...more });
+
 export class SiteMap {
   // element: is filled by the map; scene: label, box and layers as of map_layers.py; onPick(x, y, mark): a click, but on a mark that leads to a page.
   // fills_page of a scene: the wheel zooms at once; else it scrolls the page until the map has the focus.
