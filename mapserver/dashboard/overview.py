@@ -13,7 +13,7 @@ from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.administration import cannot_enrol
 from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
-from mapserver.dashboard.fleet_health import DAYS_SHOWN, WEEK_H, SiteHealth
+from mapserver.dashboard.fleet_health import DAY_H, DAYS_SHOWN, WEEK_H, SiteHealth
 from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges, page_of
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.map_layers import Layer, Mark
@@ -21,7 +21,7 @@ from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import Incident, dropped_words, with_acts
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, figure, hour_of, kpis
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, figure, kpis
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.trust.enrolment import RobotRegister
@@ -67,7 +67,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
 def now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
-    end_ns = (hour_of(time.time_ns()) + 1) * HOUR_NS
+    first_h, end_h = hours_within(None, None, time.time_ns(), DAYS_SHOWN * DAY_H)
     (floors, guests), (alerts, own) = _floors(services, context), alerts_of(services, health)
     rows = _rows(services, context)
     rows.sort(key=lambda row: row[0].tone in {"good", "quiet"} and not _is_troubled(row[0]))
@@ -76,7 +76,7 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
         "notices": _notices(services, context, health, alerts),
         "figures": _figures(live, health),
         "days": [] if health.day.failures.low is None else [day.per_robot_day for day in health.days],
-        "span": (end_ns - DAYS_SHOWN * 24 * HOUR_NS, end_ns),
+        "span": (first_h * HOUR_NS, end_h * HOUR_NS),
         "trends": context.to("trends"),
         "robots": [_listed(row, own.get(row[0].name)) for row in rows] + guests,
         "marks": _marks(context, live),
@@ -290,7 +290,6 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
     live, health = services.robots.look(context.site), services.health.site(context.site)
     span_ns = context.time_range()
     day, when, trend, areas = health.day, "last 24 h", f"; {health.trend}", list(health.areas)
-    has_areas = bool(services.maps.store.areas(context.site))
     if span_ns != EVER:
         day, when, trend = services.health.span(context.site, *span_ns), "chosen hours", ""
         areas = services.health.area_trends(context.site, *span_ns)
@@ -314,7 +313,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "areas": areas,
         "worse": trend_sentence(areas) if areas else "",
         "is_chosen": span_ns != EVER,
-        "has_areas": has_areas,
+        "has_areas": bool(services.maps.store.areas(context.site)),
         "outside": OUTSIDE,
         "since": context.written(span_ns[0] or hours_within(*span_ns, time.time_ns(), WEEK_H)[0] * HOUR_NS),
         "bars_over_time": Bars("Failures per robot-day", _bars(context, edges, rates), (edges[0], edges[-1])),

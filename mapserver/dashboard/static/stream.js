@@ -7,10 +7,10 @@ function asked() {
   if (site) found.set("site", site);
   return found;
 }
-const silent = new Set(); // page and streams, as far as the server does not answer
+const silent = {}; // whether the server does not answer, by what was asked for: the page, or a stream
 function answers(source, isSo) {
-  silent[isSo ? "delete" : "add"](source);
-  document.getElementById("silent").hidden = !silent.size;
+  silent[source] = !isSo;
+  document.getElementById("silent").hidden = !Object.values(silent).includes(true);
 }
 
 // Words of the server as nodes: what is to be typed stands between `.

@@ -4,7 +4,7 @@ from playwright.sync_api import Page
 
 from support.fleet.dashboard_scene import wait_until
 
-SIZES = ((1280, 800), (820, 1180), (390, 844))
+SIZES = ((1280, 800), (820, 1180), (360, 740))
 
 # Contrast (WCAG 2) of all words with the nearest ground that is painted behind them: the weakest, and its words.
 WEAKEST_CONTRAST = """() => {
