@@ -21,10 +21,9 @@ from mapserver.dashboard.map_layers import Layer, Picture
 from mapserver.dashboard.plan import Box, Plan, inked, make_plan, png
 from mapserver.floor_plan.alignment import PLAN, Alignment
 from mapserver.floor_plan.plan_file import decode_plan
-from mapserver.nightly.inbox import Inbox, contents, sites_of
+from mapserver.nightly.inbox import sites_of
 from mapserver.quality.gate import GateSettings
 from mapserver.releases.version_diff import Difference
-from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import MapStore, VerdictRow, VersionInfo
 
 _log = logging.getLogger(__name__)
@@ -129,10 +128,6 @@ class MapData:
     def has_version(self, site: str, version: int) -> bool:
         """Whether the store has a version."""
         return self.is_mapped(site) and any(info.version == version for info in self.store.versions(site))
-
-    def inbox_of(self, site: str) -> Inbox | None:
-        """What lies in the inbox of a site; None if the server has no inbox."""
-        return None if self.inbox is None else contents(self.inbox / site, SETTLE_S, self.store.now_ns())
 
     def foretold(self, draft: VersionInfo) -> VerdictRow:
         """What the gate would say now; kept, since it follows from the draft and the current version."""

@@ -252,7 +252,7 @@ def _nearby(services: Services, row: FailureRow) -> tuple[list[FailureRow], str]
     """Others that began within _NEAR_M, the last first; and whether it is this robot or this place, as far as counts can tell."""
     kept = services.maps.store.fleet.failures(FailureFilter(site=row.site), limit=MANY_FAILURES)
     others = [other for other in kept if other.number != row.number]
-    near = [other for other in others if _is_near(row, other)]
+    near = [other for other in others if len(both := places_of([row, other])) == 2 and dist(*both) <= _NEAR_M]
     elsewhere = sum(other.robot == row.robot for other in others) - sum(other.robot == row.robot for other in near)
     often = {0: "never failed", 1: "failed once"}.get(elsewhere, f"failed {elsewhere} times")
     own = f"{row.robot} {often} elsewhere"
@@ -265,11 +265,6 @@ def _nearby(services: Services, row: FailureRow) -> tuple[list[FailureRow], str]
         f"{len(near)} other{'s' * (len(near) > 1)} began within {_NEAR_M:.0f} m of it, {same or 'none'} with this cause"
     )
     return near, f"{told}, of {len(robots)} other robot{'s' * (len(robots) != 1)}; {own}."
-
-
-def _is_near(row: FailureRow, other: FailureRow) -> bool:
-    places = places_of([row, other])
-    return len(places) == 2 and dist(*places) <= _NEAR_M
 
 
 def _facts(context: PageContext, row: FailureRow, report: FailureReport) -> list[tuple[str, str]]:

@@ -17,6 +17,8 @@ from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
 from mapserver.fleet.alerts import with_acts
+from mapserver.nightly.inbox import contents
+from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said
@@ -96,7 +98,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is None:  # the last in which a recording was built or refused: a night in which all of them wait was none
         ended = (job for job in jobs if job.state != "running")
         chosen = next((job for job in ended if any(row.result != _WAITS for row in _recordings(job))), None)
-    inbox = services.maps.inbox_of(context.site)
+    folder, now_ns = services.maps.inbox, services.maps.store.now_ns()
+    inbox = None if folder is None else contents(folder / context.site, SETTLE_S, now_ns)
     held = () if inbox is None else with_acts(services.maps.store, of_inbox(inbox))
     shown: dict[str, object] = {
         "context": context,
