@@ -1,7 +1,7 @@
 """Measures the figures of acceptance.toml and compares them with their limits: `make acceptance`, before and after a large change.
 
 `PYTHONPATH=tests python tests/acceptance.py [NAME...] [--all] [--out FILE.json]`: without names the entries that are not marked `long`.
-Each entry of the file is a command that writes JSON to the path in place of `{out}`, and limits of figures in it: keys joined by
+Each entry is a module with its options, which writes JSON to the path in place of `{out}`, and limits of figures in it: keys joined by
 `/`, `*` for every entry of a list or table. Times are CPU times at the yardstick's reference. Entries whose recordings are missing are
 reported as not measured. Exit status 1 on any miss; a command that fails is one.
 """
@@ -27,12 +27,12 @@ COMPARISONS = {"at_most": operator.le, "at_least": operator.ge, "equals": operat
 
 
 def measured(command: str, folder: Path) -> Any:
-    """Runs a command with this interpreter in the repository's root; returns the JSON that it wrote, None if it failed."""
+    """Runs a module with this interpreter in the repository's root; returns the JSON that it wrote, None if it failed."""
     out = folder / "figures.json"
     out.unlink(missing_ok=True)
     words = [str(out) if word == "{out}" else word for word in shlex.split(command)]
     environment = os.environ | {"PYTHONPATH": SOURCES}
-    done = subprocess.run([sys.executable, *words], cwd=TESTS.parent, env=environment, check=False)
+    done = subprocess.run([sys.executable, "-m", *words], cwd=TESTS.parent, env=environment, check=False)
     return None if done.returncode else json.loads(out.read_text("utf-8"))
 
 

@@ -6,7 +6,7 @@ and rear pairs, a pair and a depth camera, RGB-D, one camera with an IMU, and tw
 the work folder; the two real ones are left out, loudly, where they are missing.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+import benchmarks  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse

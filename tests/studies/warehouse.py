@@ -1,8 +1,5 @@
 """A fulfilment centre without pictures: position failures per robot-day of the whole system, and with one decision taken away at a time."""
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import itertools
 from collections.abc import Sequence
 from functools import partial

@@ -1,14 +1,11 @@
 """Odometry over Monte-Carlo runs of the simulator without pictures: errors beside their covariance, and drift.
 
-`PYTHONPATH=tests python tests/benchmarks/back_end/bench_consistency.py [--runs N] [--seed SEED] [--out FILE.json]`;
+`PYTHONPATH=tests python -m benchmarks.back_end.bench_consistency [--runs N] [--seed SEED] [--out FILE.json]`;
 about five minutes of one core
 for 100 runs of 17 s, 15 s of them driving. Seeds 1000 to 1099 and 5000 to 5099 served to choose settings, those from 6000 were
 looked at on the way; figures to report begin at 7000.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import numpy as np
 
 from benchmarks.common import consistency

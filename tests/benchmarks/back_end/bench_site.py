@@ -4,13 +4,10 @@ CPU seconds and peak memory by keyframes, the slopes of their growth (log-log fi
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--frames N]
+    PYTHONPATH=tests python -m benchmarks.back_end.bench_site [--keyframes 250,1000] [--frames N]
         [--drive FILE] [--out FILE.json]
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import argparse
 import json
 import subprocess

@@ -1,12 +1,9 @@
 """Solvers in one run: pose graphs with and without wrong loops; local and global bundle adjustment beside gtsam's.
 
-`PYTHONPATH=tests python tests/benchmarks/back_end/bench_solvers.py [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
+`PYTHONPATH=tests python -m benchmarks.back_end.bench_solvers [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
 hour. The reference problems lie beside the project, in `../shared/data`.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """Joining as a test: foreign sessions and true ones without pictures, through the decision that builds take.
 
-    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--only PART...] [--sites 15] [--true-sites 34]
+    PYTHONPATH=tests python -m benchmarks.maps.bench_joining [--only PART...] [--sites 15] [--true-sites 34]
         [--seed 500] [--out FILE.json]
 
 A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its

@@ -1,6 +1,6 @@
 """A store under faults at every file-system call, and every format under 10^5 damaged inputs.
 
-`PYTHONPATH=tests python tests/benchmarks/maps/bench_store_faults.py [--every N] [--inputs N] [--out FILE.json]`;
+`PYTHONPATH=tests python -m benchmarks.maps.bench_store_faults [--every N] [--inputs N] [--out FILE.json]`;
 `tests/support/storage/store_faults.py` says what is tried and what is asked of the store afterwards. Exits with 1 on a fault.
 """
 

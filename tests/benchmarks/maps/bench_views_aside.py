@@ -1,13 +1,10 @@
 """Every surveyed view, looked at from half a metre and ten degrees aside: the robots' relocalizer in the published tiles.
 
-`PYTHONPATH=tests python tests/benchmarks/maps/bench_views_aside.py [--only NAME...] [--work FOLDER] [--out FILE.json]`.
+`PYTHONPATH=tests python -m benchmarks.maps.bench_views_aside [--only NAME...] [--work FOLDER] [--out FILE.json]`.
 Simulated sites are rendered from aside, the last view of the drive first; of public recordings every second frame makes no map, and
 is asked at its own place. Maps stay in the work folder.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path

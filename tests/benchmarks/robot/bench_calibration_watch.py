@@ -1,13 +1,10 @@
 """Robots with a wrong calibration in a map: what the watch finds within 30 s, what it costs until then, and false alarms.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_calibration_watch.py [--good N] [--work FOLDER] [--out FILE.json]`.
+`PYTHONPATH=tests python -m benchmarks.robot.bench_calibration_watch [--good N] [--work FOLDER] [--out FILE.json]`.
 A tote robot of a site that no development saw, in the map of its survey. `--good N` starts a good robot at N places of its drive, for 15 s
 each, instead of spoiling its calibration; each start is told its place as by a dock.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

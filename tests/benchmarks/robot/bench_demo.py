@@ -1,6 +1,6 @@
 """The figures of `make demo`: what its reports say of the build and of the two robots.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_demo.py --out FILE.json`; about three minutes.
+`PYTHONPATH=tests python -m benchmarks.robot.bench_demo --out FILE.json`; about three minutes.
 """
 
 import json

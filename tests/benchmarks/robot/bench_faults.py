@@ -1,20 +1,17 @@
 """What the localizer says while something is broken, and how soon all is well again: one line for each fault of the simulator.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_faults.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are
+`PYTHONPATH=tests python -m benchmarks.robot.bench_faults [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are
 kept in the work folder, where bench_localization.py finds the same. A row is right when the status within a second of the fault's
 beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-from fleetmap.failure_definition import ERROR_LIMIT_M
-from fleetmap.messages import Status
-
-# isort: split
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark, played, recorded, surveyed
+from fleetmap.failure_definition import ERROR_LIMIT_M
+from fleetmap.messages import Status
 from fleetsim.scenarios import SCENARIOS
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult

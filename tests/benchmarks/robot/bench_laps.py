@@ -1,13 +1,9 @@
 """The memory of a robot that drives for an hour: laps of a survey's loop, its stamps going on, in the map made of it.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_laps.py [--minutes M] [--work FOLDER] [--out FILE.json]`; recording and map as in
+`PYTHONPATH=tests python -m benchmarks.robot.bench_laps [--minutes M] [--work FOLDER] [--out FILE.json]`; recording and map as in
 bench_localization.py. Resident megabytes, the recording's samples of the whole drive among them, are taken once a minute of the drive; the
 first five are left out.
 """
-
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 
 from dataclasses import replace
 

@@ -1,13 +1,10 @@
 """A robot in the map of another day: every figure that the project promises for it.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_localization.py [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings of
+`PYTHONPATH=tests python -m benchmarks.robot.bench_localization [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings of
 `fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
 folder) and serve again. CPU times are the process's, as they are and as the machine would take that the limits are for (yardstick.py).
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import json
 import time
 from collections.abc import Sequence

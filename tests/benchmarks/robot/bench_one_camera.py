@@ -1,12 +1,9 @@
 """One camera in maps that a pair made: real drives by their left camera with the IMU, the simulator's robot with wheels, and starts.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_one_camera.py [--only NAME...] [--work FOLDER] [--out FILE.json]`.
+`PYTHONPATH=tests python -m benchmarks.robot.bench_one_camera [--only NAME...] [--work FOLDER] [--out FILE.json]`.
 Real drives are met in the map of all their own frames. Each of 20 starts is that of a robot that knows nothing, in the midst of a drive.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,15 +1,12 @@
 """Robots that are switched on where they stand, by night and without a prior: how soon each finds itself.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_standing_starts.py [--seed N] [--starts N] [--only PIPELINE...]
+`PYTHONPATH=tests python -m benchmarks.robot.bench_standing_starts [--seed N] [--starts N] [--only PIPELINE...]
 [--work FOLDER] [--out FILE.json]`. The map is that of `small-loop`'s survey by day;
 three days later, at places spread over another robot's drive, each
 robot stands and sees every frame with noise of its own. Every start is repeated with all within ELSEWHERE_M of it taken out of the map:
 what names a place then is wrong.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,6 +1,6 @@
 """How fast a survey is built, and how much memory a long one takes.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_build.py [--minutes M] [--work FOLDER] [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.survey.bench_build [--minutes M] [--work FOLDER] [--out FILE.json]
 
 The speed is that of the five aisles, recorded into the work folder, after a build of a short piece that loads the
 libraries. The long recording is the same drive again and again,

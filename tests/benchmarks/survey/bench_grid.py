@@ -1,6 +1,6 @@
 """The grid of planners against the truth of simulated warehouses, and what a night takes away of moved stock.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED ... [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.survey.bench_grid SCENARIO:SEED ... [--out FILE.json]
 
 Every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo and the cells do,
 without a survey's error. Then those of another day. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.

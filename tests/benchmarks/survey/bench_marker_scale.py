@@ -1,13 +1,10 @@
 """Scale of a survey by a rig with a wrong baseline, without and with two markers of known distance.
 
-`PYTHONPATH=tests python tests/benchmarks/survey/bench_marker_scale.py [--seed N] [--work FOLDER] [--out FILE.json]`. The loop with two
+`PYTHONPATH=tests python -m benchmarks.survey.bench_marker_scale [--seed N] [--work FOLDER] [--out FILE.json]`. The loop with two
 markers is built with a baseline that is 1 % too long, then with the calibration that `mapserver markers` writes. off: true metres per metre
 of the map's trajectory, less one.
 """
 
-import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
-
-# isort: split
 import subprocess
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,6 +1,6 @@
 """Makes the vocabulary that ships with fleetmap, from pictures of simulated warehouses and nothing else.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/default_vocabulary.py FILE.fmvb
+    PYTHONPATH=tests python -m benchmarks.survey.default_vocabulary FILE.fmvb
 
 It writes the same bytes every time, in some minutes. The warehouses are others than those that tests, demo and benches use, so
 that these measure how the vocabulary fares elsewhere.

@@ -1,0 +1,8 @@
+"""Accuracy and speed, each a program: `PYTHONPATH=tests python -m benchmarks.robot.bench_demo`.
+
+Linear algebra has one thread, as in robots and servers: others would burn a second core on small matrices. numpy is not loaded yet.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
