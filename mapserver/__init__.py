@@ -11,10 +11,9 @@ As a library:
 The names are imported when they are first used, so that `import mapserver` and `mapserver --help` stay light.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from fleetmap.errors import FleetmapError
+from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.version import __version__
@@ -32,24 +31,5 @@ if TYPE_CHECKING:
 
 __all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
 __all__ += ["__version__", "open_store"]
-
-
-def __getattr__(name: str) -> Any:
-    """Return a public name of the library (PEP 562). Raises FleetmapError if the server's libraries are not installed."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "__version__":  # read from the installation's metadata
-        return importlib.import_module("fleetmap").__version__
-    try:
-        return getattr(importlib.import_module("mapserver.library"), name)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in ("fleetmap", "mapserver"):
-            raise
-        raise FleetmapError(
-            f"mapserver.{name} needs {error.name}, which is not installed; "
-            "pip install '.[server]' in fleetmap's source folder"
-        ) from error
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+_NAMES = {"mapserver.library": " ".join(__all__), "fleetmap.version": "__version__"}  # the last one has it
+__getattr__, __dir__ = lazy_names(__name__, _NAMES, extra="server")

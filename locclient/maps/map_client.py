@@ -37,7 +37,7 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
-from fleetmap.version_grid import grid_blobs, grid_index
+from fleetmap.version_grid import grid_blobs
 from locclient.identity import MapAddress
 from locclient.maps.map_source import (
     CachedMap,
@@ -233,8 +233,8 @@ class MapClient(MapSource):
             checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
         if self.takes_grids:
             try:
-                for entry in grid_blobs(manifest, self.blob):
-                    self.blob(entry.sha256, entry.bytes)
+                for sha256, size_bytes in grid_blobs(manifest, self.blob).items():
+                    self.blob(sha256, size_bytes)
             except UnreachableError:
                 raise
             except (LinkError, MapFormatError) as error:  # planners need the grid, localization does not
@@ -245,10 +245,8 @@ class MapClient(MapSource):
         """Make a fetched version the one that the robot starts with; StoreError if a piece of it is missing."""
         addresses = addresses_of(manifest, wanted.manifest_sha256 or "")
         with suppress(LinkError, MapFormatError):  # of a grid that is not complete in the cache
-            found = [entry.sha256 for entry in grid_blobs(manifest, CachedMap(self._cache, self.site).blob)]
-            index = grid_index(manifest)
-            if index is not None and all(sha256 in self._cache for sha256 in found):
-                addresses += [index, *found]
+            found = grid_blobs(manifest, CachedMap(self._cache, self.site).blob)
+            addresses += found if all(sha256 in self._cache for sha256 in found) else ()
         self._cache.activate(self.site, manifest.version, addresses)
 
     # --- contents of a version ----------------------------------------------------------------------------------------

@@ -139,29 +139,25 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     return tiles
 
 
-def grid_index(manifest: Manifest) -> str | None:
-    """Address of the index of a version's grid, None if absent; errors as of `report_of`."""
-    report = report_of(manifest)
-    return None if report is None else report.sha256
-
-
-def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> list[TileEntry]:
-    """The tiles of a version's grid, none if absent. blob: the verified bytes of an address, up to a given size.
+def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> dict[str, int]:
+    """Addresses and sizes of a version's grid, of its index and its tiles; none if absent. blob: the verified bytes of an address, up to
+    a given size.
 
     Raises MapFormatError if they exceed the size in the manifest; errors as of `read_index`.
     """
     report = report_of(manifest)
     if report is None or report.sha256 is None:
-        return []
+        return {}
     index = read_index(blob(report.sha256, report.bytes))
     if sum(entry.bytes for entry in index.tiles) > report.bytes:
         raise MapFormatError(f"grid of version {manifest.version}: more than the {report.bytes} bytes of its manifest")
-    return list(index.tiles)
+    return {report.sha256: report.bytes} | {entry.sha256: entry.bytes for entry in index.tiles}
 
 
 def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     """As `grid_of`; no tiles for a version without a grid."""
-    return {} if grid_index(manifest) is None else grid_of(manifest, blob)
+    report = report_of(manifest)
+    return {} if report is None or report.sha256 is None else grid_of(manifest, blob)
 
 
 def report_of(manifest: Manifest) -> GridReport | None:

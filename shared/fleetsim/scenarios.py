@@ -8,7 +8,7 @@ import msgspec
 from fleetmap.errors import chosen
 from fleetsim.motion.routes import Route
 from fleetsim.scene.layout import Layout
-from fleetsim.scene.movers import Mover
+from fleetsim.scene.movers import Mover, patrol
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import ROBOTS, RobotKind
 
@@ -128,11 +128,11 @@ def _busy() -> Scenario:
     y = [layout.aisle_y_m(aisle) for aisle in range(4)]
     middle, right = layout.length_m / 2, layout.length_m - _END_M
     movers = (
-        Mover("person", ((8.0, y[0] + 0.8), (24.0, y[0] + 0.8)), 0.9),
-        Mover("person", ((6.0, y[1] - 0.8), (20.0, y[1] - 0.8)), 1.1, 5.0),
-        Mover("forklift", ((middle, y[2] + 0.7), (middle + 9, y[2] + 0.7)), 0.8),
-        Mover("robot", ((4.0, y[3] - 0.7), (right, y[3] - 0.7)), 1.2),
-        Mover("robot", ((9.0, y[0] - 0.8), (18.0, y[0] - 0.8)), 0.7),
+        patrol("person", ((8.0, y[0] + 0.8), (24.0, y[0] + 0.8)), 0.9),
+        patrol("person", ((6.0, y[1] - 0.8), (20.0, y[1] - 0.8)), 1.1, 5.0),
+        patrol("forklift", ((middle, y[2] + 0.7), (middle + 9, y[2] + 0.7)), 0.8),
+        patrol("robot", ((4.0, y[3] - 0.7), (right, y[3] - 0.7)), 1.2),
+        patrol("robot", ((9.0, y[0] - 0.8), (18.0, y[0] - 0.8)), 0.7),
     )
     passing = Route(((_END_M, y[0]), (right, y[0]), (right, y[1]), (_END_M, y[1])), stops=((1, 2.0),))
     runs = {

@@ -1,12 +1,7 @@
 """Export of a replay as an MCAP file for Foxglove: map, robot, path, fixes, images and failures."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
 import numpy as np
 
-from fleetmap.files import appearing_file
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import BASE, CAMERA, MAP, ODOM, ChannelWriter, RobotMark
@@ -81,10 +76,3 @@ class RunExport:
         pixels, expected = fix.matched.pixels[:, :2], self._rectifier.camera.pixel_from_point(points_cam)[:, :2]
         kept = np.isfinite(expected).all(axis=1)
         self._write(channels.matches(stamp_ns, pixels[kept], expected[kept]))
-
-
-@contextmanager
-def run_export(path: Path) -> Iterator[RunExport]:
-    """Write the file at `path`, which appears when the block succeeds. StoreError on a disk error."""
-    with appearing_file(path) as file, ChannelWriter(file) as writer:
-        yield RunExport(writer)

@@ -11,7 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Image
 from fleetsim.render.optics import Optics
 from fleetsim.scene.light import GREY_PER_MS, Exposure, sensor_noise_of
-from fleetsim.scene.movers import AnyMover, add_movers, mover_light
+from fleetsim.scene.movers import Mover, add_movers, mover_light
 from fleetsim.scene.world import Scene, World
 
 Path = Callable[[float], Array]  # t_s -> map_from_cam
@@ -44,7 +44,7 @@ class Painter:
         world: World,
         optics: Optics,
         number: int,
-        movers: tuple[AnyMover, ...] = (),
+        movers: tuple[Mover, ...] = (),
         *,
         has_blur: bool = True,
         has_noise: bool = True,

@@ -12,7 +12,7 @@ from fleetsim.motion.body_motion import Motion
 from fleetsim.render.optics import make_optics
 from fleetsim.render.painter import Painter, Shot
 from fleetsim.scene.light import LIGHT_STATES, Exposure, auto_exposure
-from fleetsim.scene.movers import AnyMover, Apparition
+from fleetsim.scene.movers import Mover
 from fleetsim.scene.stock import mix
 from fleetsim.scene.world import World
 from fleetsim.sensors.faults import OVER_EXPOSURE, Fault, FaultPlan
@@ -30,7 +30,7 @@ class RigRenderer:
         motion: Motion,
         *,
         light: str = "day",
-        movers: tuple[AnyMover, ...] = (),
+        movers: tuple[Mover, ...] = (),
         faults: tuple[Fault, ...] = (),
         key: int = 0,
         has_blur: bool = True,
@@ -41,7 +41,7 @@ class RigRenderer:
         self.faults = FaultPlan(faults)
         self.imu_minus_cam_s = rig.cameras[0].imu_minus_cam_s
         if any(fault.name == "person-in-front" for fault in faults):
-            self.movers = (*movers, Apparition("person", self._person_in_front))
+            self.movers = (*movers, Mover("person", self._person_in_front))
         self._painters = [
             Painter(world, make_optics(camera), number, self.movers, has_blur=has_blur)
             for number, camera in enumerate(rig.cameras)
@@ -93,9 +93,9 @@ class RigRenderer:
         self._last_right = shots[1].image
         return shots
 
-    def _person_in_front(self, t_s: float) -> tuple[float, float, float] | None:
+    def _person_in_front(self, t_s: float) -> tuple[float, float, float]:
         if not self.faults.has("person-in-front", t_s):
-            return None
+            return -1e4, -1e4, 0.0  # out of sight
         map_from_cam = self.path(0)(t_s)
         x, y, _ = map_from_cam[:3, 2]
         ahead = map_from_cam[:3, 3] + _PERSON_AHEAD_M * map_from_cam[:3, 2] / np.hypot(x, y)

@@ -1,6 +1,6 @@
 """People, forklifts and robots that move through the hall, as groups of boxes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,40 +62,28 @@ MOVER_KINDS: dict[str, tuple[Callable[[float], list[Part]], float]] = {
 
 @dataclass(frozen=True, slots=True)
 class Mover:
-    """A mover that follows the closed polyline `stations_map` (x, y) endlessly; with two stations back and forth."""
+    """A mover of MOVER_KINDS. place: x, y, yaw in map at a time."""
 
     kind: str
-    stations_map: tuple[tuple[float, float], ...]
-    speed_mps: float
-    start_m: float = 0.0
+    place: Callable[[float], tuple[float, float, float]]
 
-    def place(self, t_s: float) -> tuple[float, float, float]:
-        """x, y, yaw in map at t."""
-        path = np.array([*self.stations_map, self.stations_map[0]])
-        legs = np.diff(path, axis=0)
-        lengths = np.hypot(legs[:, 0], legs[:, 1])
-        along = (self.start_m + self.speed_mps * t_s) % max(float(lengths.sum()), 1e-9)
+
+def patrol(kind: str, stations_map: Sequence[tuple[float, float]], speed_mps: float, start_m: float = 0.0) -> Mover:
+    """A mover that follows the closed polyline `stations_map` (x, y) endlessly; with two stations back and forth."""
+    path = np.array([*stations_map, stations_map[0]])
+    legs = np.diff(path, axis=0)
+    lengths = np.hypot(legs[:, 0], legs[:, 1])
+
+    def place(t_s: float) -> tuple[float, float, float]:
+        along = (start_m + speed_mps * t_s) % max(float(lengths.sum()), 1e-9)
         leg = min(int(np.searchsorted(np.cumsum(lengths), along, side="right")), len(legs) - 1)
         x, y = path[leg] + ((along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)) * legs[leg]
         return float(x), float(y), float(np.arctan2(legs[leg, 1], legs[leg, 0]))
 
-
-@dataclass(frozen=True, slots=True)
-class Apparition:
-    """A mover placed by a function of time; None while absent."""
-
-    kind: str
-    place_at: Callable[[float], tuple[float, float, float] | None]
-
-    def place(self, t_s: float) -> tuple[float, float, float]:
-        """x, y, yaw in map at t; far below the ground while absent."""
-        return self.place_at(t_s) or (-1e4, -1e4, 0.0)
+    return Mover(kind, place)
 
 
-AnyMover = Mover | Apparition
-
-
-def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Textures, t_s: float) -> Array:
+def add_movers(builder: FaceBuilder, movers: tuple[Mover, ...], textures: Textures, t_s: float) -> Array:
     """Add the movers at time t; return their soft shadows (M, 3): x, y, 1 / radius^2."""
     materials = {f"cloth{number}": cloth for number, cloth in enumerate(textures.cloth)}
     materials |= {"vest": textures.vest, "grey": textures.grey, "dark": textures.dark, "hazard": textures.hazard}
@@ -112,7 +100,7 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
     return shadows
 
 
-def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
+def mover_light(faces: Faces, movers: tuple[Mover, ...], floor_light: list[float], t_s: float) -> Array:
     """Light samples of the movers' faces: the ground's light at each one's place, by side."""
     of_box = np.repeat(np.array(floor_light), [len(MOVER_KINDS[mover.kind][0](t_s)) for mover in movers])
     per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from fleetsim.motion.routes import Route
-from fleetsim.scene.movers import Mover
+from fleetsim.scene.movers import patrol
 from fleetsim.sensors.faults import Fault
 from studies.robot_days.site import LAYOUT, Trip, random_route
 from support.estimator.simulated_run import Smudge
@@ -101,7 +101,7 @@ def _met(kind: str, count: int, speed_mps: float, beside_m: float) -> TripOf:
             for _ in range(count):
                 x_m, reach_m = float(rng.uniform(*sorted((start_x, end_x)))), float(rng.uniform(1.0, 4.0))
                 stations = ((x_m - reach_m, side_y), (x_m + reach_m, side_y))
-                movers.append(Mover(kind, stations, speed_mps, float(rng.uniform(0.0, 4 * reach_m))))
+                movers.append(patrol(kind, stations, speed_mps, float(rng.uniform(0.0, 4 * reach_m))))
         return Trip("", (way,), movers=tuple(movers))
 
     return trip

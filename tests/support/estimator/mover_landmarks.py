@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetsim.scene.movers import MOVER_KINDS, AnyMover
+from fleetsim.scene.movers import MOVER_KINDS, Mover
 from support.estimator.landmarks import Landmarks
 
 _CELL_M, _SMALLEST_COSINE = 0.08, 0.15
@@ -18,7 +18,7 @@ _FIRST_ID = np.uint64(1) << np.uint64(62)  # above those of things that stand
 class MoverLandmarks:
     """The movers of a run, at any moment."""
 
-    def __init__(self, movers: tuple[AnyMover, ...]) -> None:
+    def __init__(self, movers: tuple[Mover, ...]) -> None:
         self._movers = movers
 
     def boxes(

@@ -7,6 +7,7 @@ and cannot read a single message again. Source of the layout: rosbag2_storage_sq
 
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -47,13 +48,9 @@ class SqliteFiles(AnyEncoding):
 
     def __init__(self, files: Sequence[Path]) -> None:
         super().__init__(files)
-        self._databases: list[sqlite3.Connection] = []
-        try:
-            for file in files:
-                self._databases.append(_opened(file))
-        except BaseException:
-            self.close()
-            raise
+        with ExitStack() as opened:
+            self._databases = [opened.enter_context(_opened(file)) for file in files]
+            self._files = opened.pop_all()
 
     def messages(self) -> Iterator[Message]:
         """See Container: in the order of rows, which is the order of writing."""
@@ -104,36 +101,34 @@ class SqliteFiles(AnyEncoding):
         return bytes(unpack_message(memoryview(found[0])))
 
     def close(self) -> None:
-        for database in self._databases:
-            database.close()
+        self._files.close()
 
 
-def _opened(file: Path) -> sqlite3.Connection:
+@contextmanager
+def _opened(file: Path) -> Iterator[sqlite3.Connection]:
     """Open a connection that writes nothing, not even beside the file; RecordingError for anything but a recording."""
     if file_head(file, len(_MAGIC)) != _MAGIC:
         fault = what_file_instead(file) or "not an SQLite database; copy the recording again"
         raise RecordingError(f"{file} is {fault}")
     # Used by one thread at a time, but not always by the one that opened it
-    database = sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
-    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
-    database.text_factory = lambda text: text.decode("utf-8", "replace")
-    try:
-        database.execute("PRAGMA trusted_schema = OFF")
-        tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not {"topics", "messages"} <= tables:
-            found = ", ".join(sorted(str(name) for name in tables)[:5]) or "nothing"
-            raise RecordingError(f"{file} is an SQLite database, but not a rosbag2 recording: it holds {found[:200]}")
-        for question in (_TOPICS, _MESSAGES):
-            database.execute(f"{question} LIMIT 0")
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        database.close()
-        lacks = "no such column" in str(error)
-        fault = "no such columns as rosbag2's in its tables" if lacks else "damaged or cut off"
-        raise RecordingError(f"{file} cannot be read ({fault}); {_recovery(file)}") from error
-    except BaseException:
-        database.close()
-        raise
-    return database
+    name = f"{file.absolute().as_uri()}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(name, uri=True, check_same_thread=False)) as database:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
+        try:
+            database.execute("PRAGMA trusted_schema = OFF")
+            tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            if not {"topics", "messages"} <= tables:
+                found = ", ".join(sorted(str(name) for name in tables)[:5]) or "nothing"
+                fault = f"not a rosbag2 recording: it holds {found[:200]}"
+                raise RecordingError(f"{file} is an SQLite database, but {fault}")
+            for question in (_TOPICS, _MESSAGES):
+                database.execute(f"{question} LIMIT 0")
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            lacks = "no such column" in str(error)
+            fault = "no such columns as rosbag2's in its tables" if lacks else "damaged or cut off"
+            raise RecordingError(f"{file} cannot be read ({fault}); {_recovery(file)}") from error
+        yield database
 
 
 def _recovery(file: Path) -> str:

@@ -9,7 +9,7 @@ import bisect
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -103,7 +103,7 @@ class VideoReader(ImageReader):
     def _decode(self, wanted: int) -> Any:
         """Decode the frame of that time; None if absent."""
         if self._open is None:
-            self._open = _opened(self.read_files[0], self._files)
+            self._open = self._files.enter_context(_opened(self.read_files[0]))
         container, stream = self._open
         last = -1 if self._last is None else self._last.pts
         if not (last < wanted and bisect.bisect(self._keys, last) == bisect.bisect(self._keys, wanted) > 0):
@@ -113,15 +113,15 @@ class VideoReader(ImageReader):
         return found if found is not None and found.pts == wanted else None
 
 
-def _opened(path: Path, files: ExitStack) -> tuple[Any, Any]:
-    """Container and stream by MP4's demuxer, which gets bytes and no path that it could follow; files: closes them."""
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Container and stream by MP4's demuxer, which gets bytes and no path that it could follow."""
     try:
         import av
     except ImportError as error:
         install = "pip install '.[video]' in fleetmap's source folder"
         raise RecordingError(f"{path} needs another library: {install}") from error
-    with ExitStack() as opened:
-        file = opened.enter_context(path.open("rb"))
+    with path.open("rb") as file, ExitStack() as opened:
         try:
             _check_tables(path, file)
             container = opened.enter_context(av.open(file, mode="r", format="mp4"))
@@ -132,8 +132,8 @@ def _opened(path: Path, files: ExitStack) -> tuple[Any, Any]:
         problem = "its codec is not known" if stream else "it holds no pictures"
         if codec is not None and codec.width * codec.height <= MAX_PIXELS:
             codec.options = {"max_pixels": str(MAX_PIXELS)}
-            files.push(opened.pop_all())
-            return container, stream
+            yield container, stream
+            return
         if codec is not None:
             problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
         raise RecordingError(f"{path} cannot be read as a video: {problem}; {_conversion(path)}")
@@ -182,8 +182,7 @@ def _errors() -> tuple[type[Exception], ...]:
 
 def _index(path: Path, log: ReadLog) -> tuple[ImageSeries, list[int]]:
     """Index the frames by the container's packets, and the times of its key frames; RecordingError if there are none."""
-    with ExitStack() as files:
-        container, stream = _opened(path, files)
+    with _opened(path) as (container, stream):
         try:
             packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
             told, unit = stream.frames, stream.time_base
