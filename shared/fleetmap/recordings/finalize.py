@@ -40,9 +40,9 @@ class RecordingParts:
     ground_truth: Trajectory | None = None
 
 
-def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
+def calibration_of_options(options: OpenOptions, log: ReadLog) -> RigCalibration | None:
     """The calibration chosen by the caller, None to use the recording's own."""
-    return None if options.calibration_file is None else logged_calibration(options.calibration_file, log)
+    return None if options.calibration_file is None else logged_calibration(options.calibration_file, log).calibration
 
 
 def logged_calibration(file: Path, log: ReadLog) -> CalibrationFile:

@@ -5,7 +5,6 @@ Euler angles are safe here: a ground robot never pitches anywhere near 90 degree
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,23 +38,6 @@ _START_S = -6 * _KNOT_S  # of the first control point
 _SQUAT_RAD_PER_MPS2, _LEAN_S = 0.006, 0.004
 
 
-class Motion(Protocol):
-    """Exact pose, rates and forces of the body at times (N,) in seconds from the start."""
-
-    @property
-    def duration_s(self) -> float:
-        """Length in time."""
-
-    def map_from_body(self, times_s: Array) -> Array:
-        """(N, 4, 4)."""
-
-    def rates(self, times_s: Array) -> tuple[Array, Array]:
-        """Angular rate rad/s and specific force m/s^2, both (N, 3) in body axes."""
-
-    def velocity_body(self, times_s: Array) -> Array:
-        """(N, 3) m/s in body axes."""
-
-
 @dataclass(frozen=True, slots=True)
 class Shake:
     """Floor ripple at full speed, rms."""
@@ -73,6 +55,7 @@ class RouteMotion:
         self._control = _control_points(path, height_m, shake, rng)
 
     def map_from_body(self, times_s: Array) -> Array:
+        """(N, 4, 4)."""
         values = self._at(times_s)
         stacked = np.zeros((len(values), 4, 4))
         stacked[:, :3, :3] = rotation_from_yaw_pitch_roll(values[:, 3:])
@@ -81,7 +64,7 @@ class RouteMotion:
         return stacked
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
-        """Angular rate and specific force, (N, 3) each, body axes, in closed form. Source: ZYX Euler kinematics."""
+        """Angular rate rad/s and specific force m/s^2, both (N, 3) in body axes, in closed form. Source: ZYX Euler kinematics."""
         values, first, second = (self._at(times_s, order) for order in range(3))
         pitch, roll = values[:, 4], values[:, 5]
         d_yaw, d_pitch, d_roll = first[:, 3], first[:, 4], first[:, 5]
@@ -98,6 +81,7 @@ class RouteMotion:
         return gyro, np.einsum("nji,nj->ni", rotation, force_map)
 
     def velocity_body(self, times_s: Array) -> Array:
+        """(N, 3) m/s in body axes."""
         rotation = rotation_from_yaw_pitch_roll(self._at(times_s)[:, 3:])
         return np.asarray(np.einsum("nji,nj->ni", rotation, self._at(times_s, 1)[:, :3]))
 
@@ -178,6 +162,10 @@ class CarriedMotion:
         for number, answer in enumerate(answers):
             merged[piece == number] = answer
         return merged
+
+
+Motion = RouteMotion | CarriedMotion
+"""Exact pose, rates and forces of the body at times (N,) in seconds from the start, of `duration_s` in all."""
 
 
 def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:

@@ -54,7 +54,7 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
         sensor = read_yaml(imu_file)
         euroc_from_imu, noise = sensor.matrix("T_BS"), imu_noise(sensor) or ImuNoise()
     if given := calibration_of_options(options, log):
-        return given.calibration, euroc_from_imu
+        return given, euroc_from_imu
     camera_files = [root / f"mav0/cam{i}/sensor.yaml" for i in range(count)]
     if missing := [file for file in camera_files if not file.is_file()]:
         for chain in (root / name for name in _CAMCHAINS if (root / name).is_file()):

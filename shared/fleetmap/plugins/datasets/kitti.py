@@ -43,9 +43,7 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
     log = ReadLog()
     present = [name for name in _RAW_CAMERAS if (path / name / "data").is_dir()]
     cameras = [_images(path / name / "data", _raw_stamps(path / name / "timestamps.txt", log), log) for name in present]
-    if given := calibration_of_options(options, log):
-        calibration = given.calibration
-    else:
+    if (calibration := calibration_of_options(options, log)) is None:
         files = [folder / "calib_cam_to_cam.txt" for folder in (path, path.resolve().parent)]
         file = next((each for each in files if each.is_file()), files[0])
         calibration = RigCalibration(
@@ -121,9 +119,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         check_seconds(float(np.abs(seconds).max()), str(times_file))
         stamps_of_number = np.round(seconds * 1e9).astype(np.int64)
     left, right = (_images(path / name, stamps_of_number, log) for name in (left_name, right_name))
-    if given := calibration_of_options(options, log):
-        calibration = given.calibration
-    else:
+    if (calibration := calibration_of_options(options, log)) is None:
         file, size_px = path / "calib.txt", _size_px(left)
         names = (f"P{row}" for row in (left_row, right_row))
         calibration = RigCalibration(tuple(_projected(file, _rows(file), name, size_px) for name in names))

@@ -43,7 +43,7 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     if len(colour) == 0:
         raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")
     given = calibration_of_options(options, log)
-    calibration = given.calibration if given else _default_calibration(colour.sources[0], depth.sources[0])
+    calibration = given or _default_calibration(colour.sources[0], depth.sources[0])
     colour_camera, depth_camera = calibration.cameras[0], calibration.cameras[min(1, len(calibration.cameras) - 1)]
     register = DepthRegistration(colour_camera, depth_camera).registered
     calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)

@@ -46,8 +46,7 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
         )
     if (path / "accelerometer.txt").is_file():
         log.note("accelerometer not used", "it comes without a gyro")
-    given = calibration_of_options(options, log)
-    calibration = given.calibration if given else _published(path)
+    calibration = calibration_of_options(options, log) or _published(path)
     cam_from_body = se3_inverse(calibration.cameras[0].body_from_cam)
 
     def read_truth(file: Path) -> Trajectory:

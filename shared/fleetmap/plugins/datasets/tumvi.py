@@ -29,7 +29,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     given, camchain = calibration_of_options(options, log), path / "camchain.yaml"
     if given is None and not camchain.is_file():
         raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
-    frames = rig_frames(path, log, cameras, (given or logged_calibration(camchain, log)).calibration)
+    frames = rig_frames(path, log, cameras, given or logged_calibration(camchain, log).calibration)
     imu, truth = read_imu(path / "imu.txt", log), read_ground_truth(path / "gt_imu.csv", log)
     return finalize(RecordingParts(path, "tumvi", *frames, imu=imu, ground_truth=truth), log)
 

@@ -42,8 +42,8 @@ def recognises(path: Path) -> bool:
 def open_video(path: Path, options: OpenOptions) -> Recording:
     """Open the recording in a video: one camera, no IMU."""
     log = ReadLog(files=[path])
-    given = calibration_of_options(options, log)
-    if given is None:
+    calibration = calibration_of_options(options, log)
+    if calibration is None:
         raise CalibrationError(f"{path}: a video holds no calibration; pass one with --calibration FILE")
     series, keys = _index(path, log)
     log.issues.append(UNCERTAIN_STAMPS)
@@ -52,7 +52,7 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
         if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
             log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
         frames = SeriesFrames(reader, (paired(series, {}, log),))
-        return finalize(RecordingParts(path, "video", given.calibration, frames, name=path.stem), log)
+        return finalize(RecordingParts(path, "video", calibration, frames, name=path.stem), log)
     except BaseException:
         reader.close()
         raise

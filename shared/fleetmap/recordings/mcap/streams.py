@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import RecordingParts, finalize, logged_calibration
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT, UNDECODABLE, Channel, Container, Place
@@ -105,7 +105,7 @@ def opened(
 ) -> Iterator[tuple[Container, CalibrationFile | None, ReadLog]]:
     """Open a container, beside the calibration that the caller chose, if any; closed if the block fails."""
     log = ReadLog()
-    given = calibration_of_options(options, log)
+    given = None if options.calibration_file is None else logged_calibration(options.calibration_file, log)
     container = opener()
     try:
         yield container, given, log
