@@ -25,8 +25,8 @@ from fleetmap.recordings.sensor_subset import sensor_set_of
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
 from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildOptions, BuildRequest, BuildResult, Draft, build_draft, picture_png
-from mapserver.drafting.report import write_file
+from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft, build_draft, picture_png
+from mapserver.drafting.report import BuildResult, write_file
 from mapserver.quality.gate import GateSettings
 from mapserver.store import NOBODY, Actor, MapStore
 from mapserver.survey.settings import SurveySettings

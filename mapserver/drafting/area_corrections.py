@@ -97,7 +97,7 @@ class AreaCorrections:
 
     def frozen(self, points_map: AnyArray) -> Mask:
         """Return (N,) which points (N, 2) or (N, 3) are kept as in the version before."""
-        return self._is_in(CorrectionKind.FREEZE, points_map)
+        return inside_any(points_map, _polygons(_of(self.areas, CorrectionKind.FREEZE)))
 
     @property
     def freezes(self) -> bool:
@@ -117,10 +117,7 @@ class AreaCorrections:
 
     def is_unused(self, points_map: AnyArray) -> Mask:
         """Return (N,) which points are never used."""
-        return self._is_in(CorrectionKind.NEVER_USE, points_map)
-
-    def _is_in(self, kind: CorrectionKind, points_map: AnyArray) -> Mask:
-        return inside_any(points_map, _polygons(_of(self.areas, kind)))
+        return inside_any(points_map, _polygons(_of(self.areas, CorrectionKind.NEVER_USE)))
 
 
 def driven_since(found: MergedMap, since_ns: int) -> Array:

@@ -36,6 +36,7 @@ from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.drafting.report import (
     BuildReport,
+    BuildResult,
     library_versions,
     loop_places,
     make_report,
@@ -55,10 +56,9 @@ from mapserver.drafting.survey_recordings import (
     say_left_out,
     survey_all,
     survey_recording,
-    taken,
 )
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
-from mapserver.evaluation.trajectory_error import Accuracy, accuracy, truth_from_estimate
+from mapserver.evaluation.trajectory_error import accuracy, truth_from_estimate
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
@@ -136,22 +136,6 @@ class _Run:
             yield SurveyTools(progress, self.images, executor)
 
 
-@dataclass(frozen=True)
-class BuildResult:
-    """The surveys and their outcomes: the map in its final frame, its accuracy, its corrections, and whether it is the site's first."""
-
-    surveyed: list[RecordingSurvey]
-    joined: MergedMap
-    accuracy: Accuracy
-    corrections: AreaCorrections
-    is_first: bool
-
-    @property
-    def taken(self) -> list[RecordingSurvey]:
-        """The recordings that were joined to the map."""
-        return taken(self.surveyed, self.joined)
-
-
 @dataclass(frozen=True, slots=True)
 class Draft:
     """A stored draft: its version, a summary sentence, its report, and the reasons for left-out recordings by content hash."""
@@ -202,7 +186,7 @@ def build_draft(
             if parent is not None:
                 parent = built.corrections.applied(parent)
             draft = _keep(run, built, parent, maps)
-            draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
+            draft = replace(draft, report=draft.report | {"loop_places": loop_places(built)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
             return draft, built
 
@@ -279,9 +263,7 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     run.times.begin("storing")
     known_m = None if before is None else before.report.get("alias_step_m")
     report = make_report(
-        built.surveyed,
-        built.joined,
-        built.accuracy,
+        built,
         evidence,
         sum(run.times.seconds.values()),
         surveyed_requests=covered_requests(maps, site, built.joined),
@@ -390,5 +372,5 @@ def _write_files(run: _Run, built: BuildResult, draft: Draft) -> None:
         write_file(options.picture, picture_png(site, draft, built))
     if options.report is not None:
         full: dict[str, Any] = {"site": site, "version": draft.version}
-        full = draft.report | full | report_details(built.taken, built.joined, built.accuracy, run.times.seconds)
+        full = draft.report | full | report_details(built, run.times.seconds)
         write_file(options.report, to_json(full, indent=2) + b"\n")

@@ -2,8 +2,7 @@
 
 import resource
 import shlex
-from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
+from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories, taken
 from mapserver.evaluation.trajectory_error import Accuracy
 from mapserver.quality.directions import one_way_words
@@ -59,17 +59,26 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     removed_landmarks: dict[str, int] = {}
 
 
-def make_report(
-    recordings: Sequence[RecordingSurvey],
-    joined: MergedMap,
-    found: Accuracy,
-    evidence: Evidence,
-    seconds: float,
-    **more: Any,
-) -> BuildReport:
-    """Return the report of surveyed recordings, map_bytes still unknown. more: keys that the caller knows."""
+@dataclass(frozen=True)
+class BuildResult:
+    """The surveys and their outcomes: the map in its final frame, its accuracy, its corrections, and whether it is the site's first."""
+
+    surveyed: list[RecordingSurvey]
+    joined: MergedMap
+    accuracy: Accuracy
+    corrections: AreaCorrections
+    is_first: bool
+
+    @property
+    def taken(self) -> list[RecordingSurvey]:
+        """The recordings that were joined to the map."""
+        return taken(self.surveyed, self.joined)
+
+
+def make_report(built: BuildResult, evidence: Evidence, seconds: float, **more: Any) -> BuildReport:
+    """Return the report of a build, map_bytes still unknown. more: keys that the caller knows."""
+    joined, recordings, found, mapped = built.joined, built.surveyed, built.accuracy, built.taken
     survey_map = joined.map
-    mapped = taken(recordings, joined)
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
     path_m = sum(float(np.linalg.norm(np.diff(t.positions_m, axis=0), axis=1).sum()) for t in joined.trajectories)
     loops = [s.survey.loops.counts() for s in mapped]
@@ -110,9 +119,7 @@ def make_report(
     )
 
 
-def report_details(
-    surveyed: Sequence[RecordingSurvey], joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
-) -> dict[str, Any]:
+def report_details(built: BuildResult, stage_s: dict[str, float]) -> dict[str, Any]:
     """Return keys of the full report beside the stable ones, for diagnosis; they may change.
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
@@ -120,7 +127,8 @@ def report_details(
     IMU. pair_turn, of the first view, and pair_turn_of_views: see survey/bundle/stereo_yaw_check.py. parts: the connected
     components of each survey; the kept one is in the map.
     """
-    survey_map, first = joined.map, surveyed[0]
+    survey_map, surveyed, found = built.joined.map, built.taken, built.accuracy
+    first = surveyed[0]
     return {
         "format": first.format,
         "sensor_set": first.sensor_set.value,
@@ -161,13 +169,13 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     return f"site {site}: draft {version}{built_on} {whole}; make it current with {publish}"
 
 
-def loop_places(mapped: Sequence[RecordingSurvey], joined: MergedMap) -> list[dict[str, Any]]:
+def loop_places(built: BuildResult) -> list[dict[str, Any]]:
     """Return loops of the recordings in the map: accepted ones and the most similar refused ones.
 
     Each has its recording, both ends (x, y) in `map`, verdict, reason and score.
     """
     accepted, refused = list[dict[str, Any]](), list[dict[str, Any]]()
-    for recording, trajectory in zip(mapped, map_trajectories(joined), strict=True):
+    for recording, trajectory in zip(built.taken, map_trajectories(built.joined), strict=True):
         survey = recording.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
         # Records have keyframe numbers from before components were left out: then their places are unknown.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleetmap.errors import UsageError, disk_errors
+from mapserver.store.files import file_mark
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -95,11 +96,9 @@ class HttpCertificate:
         except ValueError as error:
             raise UsageError(f"{self.certificate} holds no certificate ({error}); put a complete one there") from error
 
-    def _mark(self) -> tuple[int, ...]:
+    def _mark(self) -> object:
         with disk_errors(f"{self.certificate} or {self.key} cannot be read", "check the paths and their rights"):
-            return tuple(
-                mark for path in (self.certificate, self.key) for mark in (path.stat().st_mtime_ns, path.stat().st_ino)
-            )
+            return file_mark(self.certificate), file_mark(self.key)
 
 
 def check_times(path: Path, certificate: "x509.Certificate", now: datetime, step: str) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from fleetmap.inertial import Preintegrated, preintegrate
@@ -55,8 +56,8 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     for term in motion.relative:
         relative.setdefault(term.i, []).append(term)
     index = _WindowIndex(
-        ObservationIndex.of(marks.obs_keyframe, count),
-        ObservationIndex.of(marks.obs_landmark, len(marks.points_map)),
+        _observations_of(marks.obs_keyframe, count),
+        _observations_of(marks.obs_landmark, len(marks.points_map)),
         relative,
     )
     # Windows write into these arrays: copying them for each window would be too slow.
@@ -73,32 +74,17 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     return state
 
 
-@dataclass(frozen=True, slots=True)
-class ObservationIndex:
-    """Observations by owner: rows (M,); those of number n from starts[n] to starts[n + 1]."""
-
-    rows: NDArray[np.int64]
-    starts: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, owners: NDArray[np.int32], count: int) -> "ObservationIndex":
-        """Return the index of owners (M,), which are numbers below `count`."""
-        rows = np.argsort(owners, kind="stable")
-        return cls(rows, np.searchsorted(owners[rows], np.arange(count + 1)))
-
-    def of_all(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the rows of some owners, ascending."""
-        counts = self.starts[numbers + 1] - self.starts[numbers]
-        first = np.repeat(self.starts[numbers] - np.cumsum(counts) + counts, counts)
-        return np.sort(self.rows[np.arange(len(first)) + first])
+def _observations_of(owners: NDArray[np.int32], count: int) -> scipy.sparse.csr_array:
+    """Return (count, M) which of M observations each owner has; owners (M,)."""
+    return scipy.sparse.csr_array((np.ones(len(owners), bool), (owners, np.arange(len(owners)))), (count, len(owners)))
 
 
 @dataclass(frozen=True, slots=True)
 class _WindowIndex:
     """Observations by keyframe and by landmark, relative terms by their first keyframe: the cost of a window depends on its size only."""
 
-    by_keyframe: ObservationIndex
-    by_landmark: ObservationIndex
+    by_keyframe: scipy.sparse.csr_array
+    by_landmark: scipy.sparse.csr_array
     relative: dict[int, list[RelativeTerm]]
 
 
@@ -110,8 +96,8 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
     marks, motion = state.landmarks, state.motion
     inside = np.flatnonzero(free)
     first, last = inside[[0, -1]]
-    touched = np.unique(marks.obs_landmark[index.by_keyframe.of_all(inside)]).astype(np.int64)
-    rows = index.by_landmark.of_all(touched)
+    touched = np.unique(marks.obs_landmark[index.by_keyframe[inside].indices]).astype(np.int64)
+    rows = np.sort(index.by_landmark[touched].indices)
     # Later keyframes are still at their odometry poses: fixed, they would pull the window back to the drift.
     rows = rows[marks.obs_keyframe[rows] <= last]
     used = np.zeros(len(free), bool)

@@ -117,6 +117,10 @@ class SessionPlace:
             priors_off_m=self.priors_off_m,
         )
 
+    def held(self, reason: str, verdict: MembershipVerdict = MembershipVerdict.UNDECIDED) -> Membership:
+        """Return that the session is not joined there."""
+        return Membership(reason, verdict, self.evidence)
+
 
 @dataclass(frozen=True)
 class SessionKeyframes:
@@ -204,11 +208,10 @@ class MembershipTest:
             is_alias = linked[ks].all() and not contradicts(self.confirmation(chosen.map_from_body, ks))
             if is_alias or not is_wrong(off_m):  # the joint adjustment takes up less
                 continue
-            return Membership(
+            return chosen.held(
                 f"its motion is broken: {len(ks)} of its keyframes, the first after {ks[0] / len(linked):.0%} of them, agree on a place "
                 f"{off_m:.1f} m from where it puts them; it slipped, was lifted, or its stamps are wrong: drive again, or build its parts "
-                "alone, with --frames",
-                evidence=chosen.evidence,
+                "alone, with --frames"
             )
         return None
 
@@ -253,17 +256,15 @@ class MembershipTest:
             return None
         if not contradicts(seen):
             bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} certainly, and half in total, are needed"
-            reason = f"it is not certain that it belongs here: {place.figures}, {bounds}; {_DRIVE_ON}"
-            return Membership(reason, evidence=place.evidence)
+            return place.held(f"it is not certain that it belongs here: {place.figures}, {bounds}; {_DRIVE_ON}")
         figures = f"{place.figures}, at most {seen.high:.0%} where half is needed"
         if place.priors_off_m is None:
-            return Membership(
+            return place.held(
                 f"the most similar place is not its own: {figures}; it was recorded elsewhere, or where or in a direction in which "
-                "the map was not: drive past a dock, the same way round as the survey, or build it as another --site",
-                evidence=place.evidence,
+                "the map was not: drive past a dock, the same way round as the survey, or build it as another --site"
             )
         reason = f"it was recorded elsewhere, or all has changed: {figures}; build it as another --site"
-        return Membership(reason, MembershipVerdict.FOREIGN, place.evidence)
+        return place.held(reason, MembershipVerdict.FOREIGN)
 
     def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
         """Return the pose with the most evidence; undecided if another is as good and no position prior distinguishes them."""
@@ -281,23 +282,20 @@ class MembershipTest:
         chosen = replace(chosen, competitor_share=competitor_share)
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
-            return Membership(
+            return chosen.held(
                 f"{len(alike)} places of the map look alike: it sees {seen} parts of the map there; drive on to where they "
-                "differ, or past a dock",
-                evidence=chosen.evidence,
+                "differ, or past a dock"
             )
         if chosen.priors_off_m is None or chosen.is_where_priors_say:
             return chosen
         if contradicts(chosen.seen):
-            return Membership(
+            return chosen.held(
                 f"it was not found where its docks are, and the most similar place, {chosen.priors_off_m:.1f} m from there, is "
-                f"not its own: {chosen.figures}; {_DRIVE_ON}, or build it as another --site",
-                evidence=chosen.evidence,
+                f"not its own: {chosen.figures}; {_DRIVE_ON}, or build it as another --site"
             )
-        return Membership(
+        return chosen.held(
             f"its docks and its view of the map give places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
-            "them out",
-            evidence=chosen.evidence,
+            "them out"
         )
 
 

@@ -59,23 +59,9 @@ def preintegrate(
     rotation, velocity, position, by_bias, cov, max_gap_s = core.preintegrate(
         *_arrays(imu), int(start_ns), int(end_ns), gyro_bias, accel_bias, densities(noise)
     )
-    return Preintegrated(
-        start_ns=int(start_ns),
-        end_ns=int(end_ns),
-        dt_s=(end_ns - start_ns) * 1e-9,
-        delta_rotation=rotation,
-        delta_velocity_mps=velocity,
-        delta_position_m=position,
-        cov=cov,
-        d_rotation_d_gyro=by_bias[0],
-        d_velocity_d_gyro=by_bias[1],
-        d_velocity_d_accel=by_bias[2],
-        d_position_d_gyro=by_bias[3],
-        d_position_d_accel=by_bias[4],
-        gyro_bias_radps=gyro_bias,
-        accel_bias_mps2=accel_bias,
-        max_gap_s=max_gap_s,
-    )
+    moments = int(start_ns), int(end_ns), (end_ns - start_ns) * 1e-9
+    derivatives = by_bias[0], by_bias[1], by_bias[2], by_bias[3], by_bias[4]
+    return Preintegrated(*moments, rotation, velocity, position, cov, *derivatives, gyro_bias, accel_bias, max_gap_s)
 
 
 def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
