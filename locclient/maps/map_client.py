@@ -3,7 +3,7 @@
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +22,7 @@ from fleetmap.errors import (
     UsageError,
     disk_errors,
 )
-from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, TileEntry
+from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest
 from fleetmap.mapformat.names import check_name, sha256_hex, verified
 from fleetmap.messages import (
     PART_BYTES,
@@ -41,7 +41,6 @@ from fleetmap.version_grid import grid_blobs
 from locclient.identity import MapAddress
 from locclient.maps.map_source import (
     CachedMap,
-    FetchedTiles,
     LocalMapSource,
     MapSource,
     ReadyVersion,
@@ -139,7 +138,6 @@ class MapClient(MapSource):
         self._brought: WantedVersion | None = None  # since the start, with all that this robot takes
         self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
-        self._away: UnreachableError | None = None  # while tiles are read
         self._begun = ""  # the manifest's address of the version that was admitted last
 
     def check_admitted(self, wanted: WantedVersion) -> None:
@@ -272,20 +270,8 @@ class MapClient(MapSource):
         """Return the verified bytes of an address, from the cache or the server; errors as of `manifest`."""
         return self._blob(self._key(f"blobs/{sha256}"), sha256, max_bytes)
 
-    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Return tiles as MapSource does, from the cache or the server. After a request without an answer only the cache is used, so that
-        a robot without a network does not wait for every tile."""
-        self._away = None
-        return super().tiles(manifest, cells)
-
-    def _tile_bytes(self, entry: TileEntry) -> bytes:
-        if self._away is not None and entry.sha256 not in self._cache:
-            raise self._away
-        try:
-            return super()._tile_bytes(entry)
-        except UnreachableError as error:
-            self._away = error
-            raise
+    def _is_at_hand(self, sha256: str) -> bool:
+        return sha256 in self._cache
 
     def _blob(self, key: str, sha256: str, max_bytes: int) -> bytes:
         """Return the verified bytes of an address, from the cache or the server, and cache them."""

@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.bow.vocabulary import shipped_vocabulary
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UsageError, disk_errors
+from fleetmap.errors import (
+    FleetmapError,
+    LinkError,
+    MapFormatError,
+    StoreError,
+    UnreachableError,
+    UsageError,
+    disk_errors,
+)
 from fleetmap.mapformat.manifest import Manifest, TileEntry, decode_manifest
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, verified
 from fleetmap.mapformat.tile import Tile
@@ -70,20 +78,27 @@ class MapSource(ABC):
         return shipped_vocabulary(entry.sha256) or self.blob(entry.sha256, entry.bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Return tiles of the version: all, or those of `cells` that it has. An unusable tile is refused with its reason."""
-        fetched = FetchedTiles()
+        """Return tiles of the version: all, or those of `cells` that it has. An unusable tile is refused with its reason.
+
+        After a request without an answer only tiles at hand are read, so that a robot without a network does not wait for each of them.
+        """
+        fetched, away = FetchedTiles(), None
         asked = None if cells is None else set(cells)
         for entry in manifest.tiles:
             cell = (entry.x, entry.y)
             if asked is None or cell in asked:
                 try:
-                    fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, self._tile_bytes(entry))
+                    if away is not None and not self._is_at_hand(entry.sha256):
+                        raise away
+                    data = self.blob(entry.sha256, entry.bytes)
+                    fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, data)
                 except FleetmapError as error:
+                    away = error if isinstance(error, UnreachableError) else away
                     fetched.refused[cell] = str(error)
         return fetched
 
-    def _tile_bytes(self, entry: TileEntry) -> bytes:
-        return self.blob(entry.sha256, entry.bytes)
+    def _is_at_hand(self, sha256: str) -> bool:
+        return True
 
 
 class CachedMap(MapSource):

@@ -132,19 +132,13 @@ def write_output(path: Path, data: bytes) -> None:
         path.write_bytes(data)
 
 
-def print_json(value: object) -> None:
-    """Print a value to stdout as indented JSON; dataclasses become objects."""
+def print_result(value: object, parts: "Iterable[str | Table | Text]", *, json: bool = False) -> None:
+    """Print the result of a command to stdout: a value as indented JSON, in which dataclasses are objects, or else its lines and tables."""
+    from fleetmap.console import plain_console
     from fleetmap.encoding import to_json
 
-    typer.echo(to_json(value, indent=2).decode())
-
-
-def print_result(value: object, parts: "Iterable[str | Table | Text]", *, json: bool = False) -> None:
-    """Print the result of a command to stdout: a value as JSON, or else its lines and tables."""
-    from fleetmap.console import plain_console
-
     if json:
-        print_json(value)
+        typer.echo(to_json(value, indent=2).decode())
         return
     for part in parts:
         if isinstance(part, str):
