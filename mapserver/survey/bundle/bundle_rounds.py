@@ -16,15 +16,8 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import RelativeTerm, SurveyState
 
 
-def bundle_rounds(
-    state: SurveyState,
-    settings: SurveySettings,
-    free: NDArray[np.bool_] | None = None,
-    rounds: int = 3,
-    *,
-    final: bool = False,
-) -> SurveyState:
-    """Return the adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
+def bundle_rounds(state: SurveyState, settings: SurveySettings, rounds: int = 3, *, final: bool = False) -> SurveyState:
+    """Return the adjusted state; outlying observations are dropped between rounds.
 
     final: near the optimum; the last round uses the redescending cost of `final_bundle` with noise measured from residuals.
     Inertial factors: Forster et al. 2017. Observations dominate the memory: a caller that holds no `state` of its own
@@ -33,15 +26,13 @@ def bundle_rounds(
     for round_number in range(rounds):
         last = round_number + 1 == rounds
         how = settings.rough_bundle if not last else settings.final_bundle if final else settings.bundle
-        problem = bundle_problem(state, settings, free)
+        problem = bundle_problem(state, settings, None)
         if last and final:
             problem = replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas))
         result = optimize(problem, how)
         state = apply_result(state, result)
         if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
-            if free is not None:
-                keep |= ~free[state.landmarks.obs_keyframe]
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
         del problem, result  # frees the dropped observations
     return state

@@ -36,19 +36,6 @@ def test_outliers_are_dropped_and_hardly_anything_else() -> None:
     assert counts.min() >= SurveySettings().min_observations
 
 
-def test_a_window_moves_nothing_outside() -> None:
-    given = scene(14, 5, drift=0.02, outliers=0.03)
-    free = np.zeros(14, bool)
-    free[5:9] = True
-    start = given.state.map_from_body.copy()
-    outside = ~free[given.state.landmarks.obs_keyframe]
-    given.state = bundle_rounds(given.state, SurveySettings(), free)
-    np.testing.assert_array_equal(given.state.map_from_body[~free], start[~free])
-    assert (np.linalg.norm((given.state.map_from_body - start)[free, :3, 3], axis=1) > 1e-4).all()
-    left = np.isin(np.flatnonzero(outside), given.state.landmarks.obs_feature)
-    assert left.mean() > 0.97  # observations from outside go only with their landmark
-
-
 @pytest.mark.parametrize("seed", [6, 7])
 def test_windows_take_the_error_out_of_a_chain(seed: int) -> None:
     """What is left is drift of the whole, which only loops can show; between neighbours the error is the noise."""
