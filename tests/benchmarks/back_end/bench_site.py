@@ -4,23 +4,22 @@ CPU seconds and peak memory by keyframes, the slopes of their growth (log-log fi
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    PYTHONPATH=tests python -m benchmarks.back_end.bench_site [--keyframes 250,1000] [--frames N]
-        [--drive FILE] [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.back_end.bench_site KEYFRAMES... [--frames N] [--work FOLDER] [--out FILE.json]
+
+The drive, of at most N frames at 7.5 Hz, stays in the work folder.
 """
 
-import argparse
-import json
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import SensorSet, Trajectory
@@ -72,15 +71,20 @@ def wrong_loops(edges: Any, survey: SimulatedSurvey) -> int:
     return wrong
 
 
-def measured(sizes: Sequence[int], drive: Path) -> Iterator[dict[str, Any]]:
-    """The figures of each size, in a process of its own whose memory has held no more than its part of the drive."""
-    for size in sizes:
-        with TemporaryDirectory(dir=drive.parent) as folder:
-            part = Path(folder) / "part.drive"
-            command = [sys.executable, __file__, "--one", str(size), "--drive"]
-            subprocess.run([*command, str(drive), "--cut", str(part)], check=True)
-            done = subprocess.run([*command, str(part)], check=True, stdout=subprocess.PIPE, text=True)
-        yield json.loads(done.stdout.splitlines()[-1])
+def cut(drive: Path, keyframes: int, part: Path) -> None:
+    """Writes the drive up to a keyframe."""
+    SimulatedSurvey.read(drive, keyframes, ImageStore()).write(part)
+
+
+def measured(size: int, drive: Path) -> dict[str, Any]:
+    """The figures of a size, in a process of its own whose memory has held no more than its part of the drive."""
+    alone = partial(ProcessPoolExecutor, 1, get_context("spawn"))
+    with TemporaryDirectory(dir=drive.parent) as folder:
+        part = Path(folder) / "part.drive"
+        with alone() as process:
+            process.submit(cut, drive, size, part).result()
+        with alone() as process:
+            return process.submit(measure, part, size).result()
 
 
 def slope(rows: list[dict[str, Any]], key: str) -> float:
@@ -93,29 +97,10 @@ def _peak_mb() -> float:
     return float(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--keyframes", default="250,1000", help="sizes, comma separated")
-    parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
-    parser.add_argument("--drive", type=Path, default=Path("out/site.drive"), help="as simulated; made where missing")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--one", type=int, default=None, help=argparse.SUPPRESS)
-    parser.add_argument("--cut", type=Path, default=None, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.cut is not None:
-        SimulatedSurvey.read(given.drive, given.one, ImageStore()).write(given.cut)
-        return
-    if given.one is not None:
-        print(json.dumps(measure(given.drive, given.one)), flush=True)
-        return
-    if not given.drive.exists():
-        given.drive.parent.mkdir(parents=True, exist_ok=True)
-        simulated_survey(session_of("fulfilment-centre", ["survey"], frames=given.frames), SETTINGS).write(given.drive)
-    rows = list(measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive))
-    slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
-    write_results(given.out, {"sizes": rows, "slopes": slopes})
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(several="keyframes", frames=12_600)
+def main(options: Options) -> Results:
+    drive = options.work / f"site-{options.frames}.drive"
+    if not drive.exists():
+        simulated_survey(session_of("fulfilment-centre", ["survey"], frames=options.frames), SETTINGS).write(drive)
+    rows = [measured(size, drive) for size in sorted(map(int, options.keyframes))]
+    return {"sizes": rows, "slopes": {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}}
