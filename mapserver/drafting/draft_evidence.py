@@ -5,9 +5,8 @@ A view that has a say, and gets no fix or a weak one, gets more landmarks.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -36,13 +35,12 @@ from mapserver.quality.probes import (
     PRIOR_RADIUS_M,
     SAME_WAY_COSINE,
     Probe,
+    anywhere,
     place_xy,
     probe_features,
     probes_of_map,
     relocalized,
-    repetition,
     spread,
-    starts_without_prior,
 )
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
@@ -334,22 +332,18 @@ def examine_draft(
     probes = Probes(held_out, replayed, [] if before is None else probes_of_map(before.survey, PROBES))
     current = None if before is None else MapView(before.tiles, vocabulary, before.survey.camera.focal_px)
     draft = MapView(stored, vocabulary, camera.focal_px)
-    tasks: list[Callable[[], Any]] = [
-        lambda: starts_without_prior(draft, probes.frames),
-        lambda: repetition(draft, probes.frames),
-        lambda: examine(draft, current, probes, _breaks(sessions), None if before is None else before.removed_ids),
-    ]
+    removed_ids = None if before is None else before.removed_ids
+    found = examine(draft, current, probes, _breaks(sessions), removed_ids, executor)
+    moved = []
     if before is not None and current is not None:
         recall = before.manifest.report.get("lookalike_recall") or 0.0
         for session in sessions:
             chosen = spread(np.arange(len(session.probed)), max(PROBES // len(sessions), _LEAST_PROBES))
             frames = session.probes([session.probed[n] for n in chosen])
-            tasks.append(partial(displaced, session.name, current, frames, recall))
-    starts, repeated, evidence, *moved = executor.map(lambda _, task: task(), None, tasks)
+            fixes = executor.map(anywhere, current, frames)
+            moved.append(displaced(session.name, current, list(zip(frames, fixes, strict=True)), recall))
     directions = tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in stored})
-    more = {"directions": directions, "starts": starts, "repetition": repeated, "displaced": moved or None}
-    found: Evidence = msgspec.structs.replace(evidence, **more)
-    return found
+    return msgspec.structs.replace(found, directions=directions, displaced=moved or None)
 
 
 def _breaks(sessions: Sequence[MappedSession]) -> TrajectoryBreaks | None:

@@ -14,14 +14,16 @@ from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, ProbeFigures, TrajectoryBreaks
 from mapserver.quality.probes import (
-    ELSEWHERE_M,
     PRIOR_RADIUS_M,
     SAME_WAY_COSINE,
     Probe,
-    anywhere,
-    most_similar_beyond,
-    relocalized,
+    ProbeFixes,
+    fixes_of,
+    fixes_with_prior,
+    repetition,
+    starts_without_prior,
 )
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.merge.session_alignment import count_places
 from mapserver.survey.settings import SessionSettings
 
@@ -39,11 +41,6 @@ class Probes:
     replayed: Sequence[Probe]
     last_version: Sequence[Probe]
 
-    @property
-    def frames(self) -> Sequence[Probe]:
-        """Return the frames from recordings, or the keyframes if there are none."""
-        return [*self.held_out, *self.replayed] or self.last_version
-
 
 def examine(
     draft: MapView,
@@ -51,44 +48,59 @@ def examine(
     probes: Probes,
     motion: TrajectoryBreaks | None,
     removed_ids: NDArray[np.uint32] | None = None,
+    executor: Executor = SERIAL,
 ) -> Evidence:
-    """Return the results of the probes in the draft, and in the current version's tiles if present; starts are left to the caller.
+    """Return the results of the probes in the draft, and in the current version's tiles if present.
 
+    Robots without a prior are measured with the frames from recordings, with the keyframes if there are none.
     removed_ids: landmarks of the current version that operators' corrections removed from the draft; None for none.
     """
-    frames = probes.frames
+    frames, keyframes = [*probes.held_out, *probes.replayed], probes.last_version
+    now = list(executor.map(fixes_of, draft, frames))
+    now += executor.map(fixes_with_prior if frames else fixes_of, draft, keyframes)
+    then = None if before is None else list(executor.map(fixes_with_prior, before, [*frames, *keyframes]))
     # Those localised in either: a draft cannot lose positions unknown to robots, and with only those of the current version all its
     # chance localisations would count against the draft.
-    held = (draft,) if before is None else (before, draft)
-    placed = [p for p in probes.last_version if any(relocalized(view, p, p.map_from_cam) is not None for view in held)]
+    found = [[fixes[n].near for fixes in (now, then) if fixes is not None] for n in range(len(now))]
+    placed = [n for n in range(len(frames), len(now)) if any(fix is not None for fix in found[n])]
+    held_out, asked = len(probes.held_out), slice(len(frames) or None)
+
+    def compared(numbers: Sequence[int]) -> Comparison | None:
+        return compare(
+            draft, before, [now[n] for n in numbers], [then[n] for n in numbers] if then else [], removed_ids
+        )
+
     return Evidence(
-        held_out=compare(draft, before, probes.held_out, removed_ids),
-        replayed=compare(draft, before, probes.replayed, removed_ids),
-        last_version=compare(draft, before, placed, removed_ids),
-        aliasing=aliasing(draft, frames),
-        aliasing_before=None if before is None else aliasing(before, frames),
+        held_out=compared(range(held_out)),
+        replayed=compared(range(held_out, len(frames))),
+        last_version=compared(placed),
+        aliasing=aliasing(now[asked]),
+        aliasing_before=None if then is None else aliasing(then[asked]),
         motion=motion,
+        starts=starts_without_prior(now[asked]),
+        repetition=repetition(now[asked]),
     )
 
 
-def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalike_recall: float) -> Displacement:
-    """Localize a recording's frames anywhere in the version before, and compare.
+def displaced(
+    recording: str, before: MapView, probes: Sequence[tuple[Probe, list[Fix]]], lookalike_recall: float
+) -> Displacement:
+    """Compare a recording's frames with their fixes anywhere in the version before.
 
     A frame at a place that looks like another one has a fix there, too. Those count that have none at their own place though that
     version has it, find more of the other than `lookalike_recall`, and agree on it by the motion between them, as many and as far apart as
     those of a joined survey.
     """
     here, placed, found = 0, list[Array](), list[Array]()
-    for probe in probes:
-        fixes = anywhere(before, probe)
+    for probe, fixes in probes:
         if any(not is_wrong(float(np.linalg.norm((fix.map_from_cam - probe.map_from_cam)[:3, 3]))) for fix in fixes):
             here += 1
             continue
         if not places_around(before.map_from_cam, probe.map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE).any():
             continue  # it may lie in an aisle that looks the same, and is new
-        fixes = [fix for fix in fixes if fix.landmark_recall > lookalike_recall]
-        placed += [probe.map_from_cam for _ in fixes]
-        found += [fix.map_from_cam for fix in fixes]
+        alike = [fix for fix in fixes if fix.landmark_recall > lookalike_recall]
+        placed += [probe.map_from_cam for _ in alike]
+        found += [fix.map_from_cam for fix in alike]
     drafted, seen = np.reshape(placed, (-1, 4, 4)), np.reshape(found, (-1, 4, 4))
     moved = [seed @ se3_inverse(own) @ drafted for own, seed in zip(drafted, seen, strict=True)]
     agreeing = [np.linalg.norm((places - seen)[:, :3, 3], axis=1) <= ERROR_LIMIT_M for places in moved]
@@ -101,22 +113,25 @@ def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalik
 
 
 def compare(
-    draft: MapView, before: MapView | None, probes: Sequence[Probe], removed_ids: NDArray[np.uint32] | None = None
+    draft: MapView,
+    before: MapView | None,
+    now: Sequence[ProbeFixes],
+    then: Sequence[ProbeFixes],
+    removed_ids: NDArray[np.uint32] | None = None,
 ) -> Comparison | None:
-    """Relocalize each probe in both maps from a prior at its own position; None without probes.
+    """Compare the same probes' fixes in both maps from a prior at their own positions; None without probes.
 
     Matches of removed landmarks do not count in inliers_share: their loss is wanted, a lost fix is not.
     """
-    if not probes:
+    if not now:
         return None
-    now = [relocalized(draft, probe, probe.map_from_cam) for probe in probes]
     if before is None:
-        return Comparison(_figures(draft, probes, now))
-    then = [relocalized(before, probe, probe.map_from_cam) for probe in probes]
-    left = [0 if fix is None else _inliers_left(before, fix, removed_ids) for fix in then]
-    shares = [a.inliers / inliers for a, inliers in zip(now, left, strict=True) if a is not None and inliers]
+        return Comparison(_figures(draft, now))
+    left = [0 if each.near is None else _inliers_left(before, each.near, removed_ids) for each in then]
+    pairs = zip(now, left, strict=True)
+    shares = [each.near.inliers / inliers for each, inliers in pairs if each.near is not None and inliers]
     inliers_share = round(float(np.median(shares)), 4) if shares else None
-    return Comparison(_figures(draft, probes, now), _figures(before, probes, then), inliers_share)
+    return Comparison(_figures(draft, now), _figures(before, then), inliers_share)
 
 
 def _inliers_left(view: MapView, fix: Fix, removed_ids: NDArray[np.uint32] | None) -> int:
@@ -125,16 +140,16 @@ def _inliers_left(view: MapView, fix: Fix, removed_ids: NDArray[np.uint32] | Non
     return fix.inliers - int(np.isin(view.landmark_ids[fix.matches[:, 1]], removed_ids).sum())
 
 
-def _figures(view: MapView, probes: Sequence[Probe], fixes: Sequence[Fix | None]) -> ProbeFigures:
-    found = [(probe, fix) for probe, fix in zip(probes, fixes, strict=True) if fix is not None]
+def _figures(view: MapView, probed: Sequence[ProbeFixes]) -> ProbeFigures:
+    found = [(each.probe, each.near) for each in probed if each.near is not None]
     if not found:
-        return ProbeFigures(len(probes), 0.0, 0.0, None, None, None, None)
+        return ProbeFigures(len(probed), 0.0, 0.0, None, None, None, None)
     off = np.stack([se3_inverse(probe.map_from_cam) @ fix.map_from_cam for probe, fix in found])
     errors_m = np.linalg.norm(off[:, :3, 3], axis=1)
     wrong = [is_wrong(error_m, rotation_angle_rad(by[:3, :3])) for error_m, by in zip(errors_m, off, strict=True)]
     return ProbeFigures(
-        frames=len(probes),
-        localised_share=round(len(found) / len(probes), 4),
+        frames=len(probed),
+        localised_share=round(len(found) / len(probed), 4),
         wrong_share=round(float(np.mean(wrong)), 4),
         median_error_m=round(float(np.median(errors_m)), 5),
         p95_error_m=round(float(np.percentile(errors_m, 95)), 5),
@@ -151,10 +166,9 @@ def _residual_px(view: MapView, probe: Probe, fix: Fix) -> float:
     return float(np.median(np.linalg.norm(expected[:, :2] - probe.features.pixels[features, :2], axis=1)))
 
 
-def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
+def aliasing(probed: Sequence[ProbeFixes]) -> Aliasing | None:
     """Offer each probe with the prior of the most similar far place; None if there is no such place."""
-    places = [(probe, most_similar_beyond(view, probe, ELSEWHERE_M)) for probe in probes]
-    accepted = [relocalized(view, probe, place) is not None for probe, place in places if place is not None]
+    accepted = [each.is_misled for each in probed if each.is_misled is not None]
     return Aliasing(len(accepted), round(float(np.mean(accepted)), 4)) if accepted else None
 
 

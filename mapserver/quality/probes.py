@@ -1,7 +1,8 @@
 """Probes: features of single images with known poses, to be relocalized in a map."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,13 +12,14 @@ from fleetmap.features.extraction import extract
 from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
+from fleetmap.relocalization.alias_search import AliasCandidate
 from fleetmap.relocalization.frame_features import FrameFeatures, with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
-from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView, most_similar
 from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, Relocalizer, is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.time_sliced import finished
+from fleetmap.time_sliced import T, TimeSliced, finished
 from mapserver.quality.figures import LookAlike, Repetition, Starts, first_of
 from mapserver.survey.survey_map import SurveyMap
 
@@ -48,18 +50,110 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
 
     Only places around the prior are searched, so its accuracy does not matter.
     """
-    around = (prior_map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
-    relocalizer = Relocalizer(view, probe.camera, _ROBOTS)
-    fixes = finished(relocalizer.anywhere(probe.features, places_around(view.map_from_cam, *around)))
-    near = (fix for fix in fixes if places_around(fix.map_from_cam[None], *around).all())
-    return next((fix for fix in near if is_reliable(fix, _ROBOTS.fix)), None)
+    return _Search(view, probe).around(prior_map_from_cam)
 
 
-def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:
-    """Return (4, 4) map_from_cam of the place most similar to a probe beyond a radius around it; None if absent."""
-    is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1) > radius_m
-    places = view.similar_places(probe.features.features.descriptors, is_far, 1)
-    return np.asarray(view.map_from_cam[places[0]]) if len(places) else None
+def aliases(view: MapView, probe: Probe) -> list[Fix]:
+    """Return the fixes that robots without a prior accept for a probe at other places than its own."""
+    return _elsewhere(probe, anywhere(view, probe))
+
+
+def anywhere(view: MapView, probe: Probe) -> list[Fix]:
+    """Return the fixes that robots without a prior accept for a probe, also at places that look like its own."""
+    return _reliable(_Search(view, probe).fixes(None))
+
+
+def _reliable(fixes: Sequence[Fix]) -> list[Fix]:
+    return [fix for fix in fixes if is_reliable(fix, _ROBOTS.fix)]
+
+
+def _elsewhere(probe: Probe, fixes: Sequence[Fix], beyond_m: float = SAME_PLACE_M) -> list[Fix]:
+    place_m = probe.map_from_cam[:3, 3]
+    return [fix for fix in fixes if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > beyond_m]
+
+
+class _Search(Relocalizer):
+    """The search for one probe: what its questions have in common, such as the fix at a place, is computed once."""
+
+    def __init__(self, view: MapView, probe: Probe) -> None:
+        super().__init__(view, probe.camera, _ROBOTS)
+        self._query, self._known = probe.features, dict[tuple[str, int], Any]()
+
+    def _once(self, what: str, number: int, compute: Callable[..., T], *arguments: Any) -> T:
+        if (what, number) not in self._known:
+            self._known[what, number] = compute(*arguments)
+        found: T = self._known[what, number]
+        return found
+
+    def similarities(self, query: FrameFeatures) -> Array:
+        return self._once("similarities", 0, super().similarities, query)
+
+    def at_place(self, query: FrameFeatures, place: int, rotation: Array | None) -> Fix | None:
+        return self._once("place", place, super().at_place, query, place, rotation)
+
+    def aliases_of(self, query: FrameFeatures, fix: Fix) -> TimeSliced[list[AliasCandidate]]:
+        yield
+        return self._once("aliases", id(fix), finished, super().aliases_of(query, fix))
+
+    def at_alias(self, query: FrameFeatures, alias: AliasCandidate, seen: Fix) -> Fix | None:
+        return self._once("alias", id(alias), super().at_alias, query, alias, seen)
+
+    def fixes(self, allowed: NDArray[np.bool_] | None) -> list[Fix]:
+        """Return all verified fixes at allowed places (K,), best first."""
+        return finished(self.anywhere(self._query, allowed))
+
+    def around(self, prior_map_from_cam: Array) -> Fix | None:
+        """Return that of `relocalized`."""
+        around = (prior_map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
+        fixes = self.fixes(places_around(self.view.map_from_cam, *around))
+        return next((fix for fix in _reliable(fixes) if places_around(fix.map_from_cam[None], *around).all()), None)
+
+    def most_similar(self, allowed: NDArray[np.bool_]) -> Array | None:
+        """Return (4, 4) map_from_cam of the most similar allowed place (K,); None without any."""
+        places = most_similar(self.similarities(self._query), allowed, 1)
+        return np.asarray(self.view.map_from_cam[places[0]]) if len(places) else None
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeFixes:
+    """Fixes of a probe in one map, by what a robot knows before.
+
+    near: accepted around the probe's own place. is_misled: True if one is accepted with the prior of the most similar place beyond
+    ELSEWHERE_M, None without such a place.
+    Without a prior: accepted ones `anywhere`; `beyond`, all fixes as if nothing within ELSEWHERE_M were mapped, None as `is_misled`.
+    """
+
+    probe: Probe
+    near: Fix | None
+    is_misled: bool | None
+    anywhere: list[Fix] = field(default_factory=list)
+    beyond: list[Fix] | None = None
+
+
+def fixes_with_prior(view: MapView, probe: Probe) -> ProbeFixes:
+    """Return the fixes of a robot with a prior."""
+    return _with_prior(_Search(view, probe), probe)
+
+
+def fixes_of(view: MapView, probe: Probe) -> ProbeFixes:
+    """Return the fixes of robots with and without a prior."""
+    search = _Search(view, probe)
+    found = _with_prior(search, probe)
+    beyond = None
+    if found.is_misled is not None:
+        beyond = _elsewhere(probe, search.fixes(_is_far(view, probe)), ELSEWHERE_M)
+    return replace(found, anywhere=_reliable(search.fixes(None)), beyond=beyond)
+
+
+def _with_prior(search: _Search, probe: Probe) -> ProbeFixes:
+    other = search.most_similar(_is_far(search.view, probe))
+    is_misled = None if other is None else search.around(other) is not None
+    return ProbeFixes(probe, search.around(probe.map_from_cam), is_misled)
+
+
+def _is_far(view: MapView, probe: Probe) -> NDArray[np.bool_]:
+    away_m = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1)
+    return np.asarray(away_m > ELSEWHERE_M)
 
 
 def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
@@ -88,22 +182,16 @@ def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
     return probes
 
 
-def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | None:
+def starts_without_prior(probed: Sequence[ProbeFixes]) -> Starts | None:
     """Use each probe as a start without a prior at an unmapped place; None if all of the map lies around each.
 
     A robot in an unmapped place is one more such probe: it exceeds the largest recall of n with a probability of 1 / (n + 1).
     Source: Vovk et al. 2005, Algorithmic Learning in a Random World, chapter 2 (conformal prediction).
     """
-    offered = [probe for probe in probes if most_similar_beyond(view, probe, ELSEWHERE_M) is not None]
-    if not offered:
+    found = [(each.probe, each.beyond) for each in probed if each.beyond is not None]
+    if not found:
         return None
-    found = []
-    for probe in offered:  # as if nothing within the radius were mapped
-        place_m = probe.map_from_cam[:3, 3]
-        is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > ELSEWHERE_M
-        fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
-        found.append((probe, [f for f in fixes if np.linalg.norm(f.map_from_cam[:3, 3] - place_m) > ELSEWHERE_M]))
-    believed = [(probe, [fix for fix in fixes if is_reliable(fix, _ROBOTS.fix)]) for probe, fixes in found]
+    believed = [(probe, _reliable(fixes)) for probe, fixes in found]
     taken = [(probe, max(fixes, key=lambda fix: fix.landmark_recall)) for probe, fixes in believed if fixes]
     return Starts(
         frames=len(found),
@@ -118,7 +206,7 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
     )
 
 
-def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
+def repetition(probed: Sequence[ProbeFixes]) -> Repetition | None:
     """Measure the smallest distance at which a map looks like itself, as a robot without a prior would see it; None without probes.
 
     Every place that robots accept for a probe's image, further away than the search takes for the same place, is an alias of its place;
@@ -126,23 +214,11 @@ def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
     Source: Ballard 1981 (the generalised Hough transform of `find_aliases`), each alias verified by its fix.
     """
     steps_m = [
-        round(float(np.linalg.norm(fix.map_from_cam[:3, 3] - probe.map_from_cam[:3, 3])), 3)
-        for probe in probes
-        for fix in aliases(view, probe)
+        round(float(np.linalg.norm(fix.map_from_cam[:3, 3] - each.probe.map_from_cam[:3, 3])), 3)
+        for each in probed
+        for fix in _elsewhere(each.probe, each.anywhere)
     ]
-    return Repetition(len(probes), min(steps_m, default=None)) if probes else None
-
-
-def aliases(view: MapView, probe: Probe) -> list[Fix]:
-    """Return the fixes that robots without a prior accept for a probe at other places than its own."""
-    place_m = probe.map_from_cam[:3, 3]
-    return [fix for fix in anywhere(view, probe) if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > SAME_PLACE_M]
-
-
-def anywhere(view: MapView, probe: Probe) -> list[Fix]:
-    """Return the fixes that robots without a prior accept for a probe, also at places that look like its own."""
-    found = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features))
-    return [fix for fix in found if is_reliable(fix, _ROBOTS.fix)]
+    return Repetition(len(probed), min(steps_m, default=None)) if probed else None
 
 
 def alias_step_m(found: Repetition | None, known_m: float | None) -> float | None:

@@ -93,20 +93,17 @@ class MapView:
         unseen = _UNSEEN_LANDMARKS * (float(weights.mean()) if len(weights) else 1.0)
         self._place_weights = np.bincount(self._place_of_shown, self._shown_weights, minlength=len(counts)) + unseen
 
-    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Rank places by the share of their landmarks, weighted by word rarity, found among descriptors (N, 32), best first.
+    def similarities(self, descriptors: NDArray[np.uint8]) -> Array:
+        """Return (K,) the share of each place's landmarks, weighted by word rarity, found among descriptors (N, 32).
 
-        Not by symmetric similarity: a map within a budget holds a tenth of what a robot sees, and absence from it proves nothing. Each
+        Not a symmetric similarity: a map within a budget holds a tenth of what a robot sees, and absence from it proves nothing. Each
         place counts for itself: added up over its neighbours, fewer right ones are among the first.
         """
         if not len(descriptors):
-            return np.zeros(0, np.int64)
+            return np.zeros(len(self.place_rows))
         weights = self._shown_weights * self._index.near(descriptors, _NEAR_BITS)[self._shown]
         shares = np.bincount(self._place_of_shown, weights, minlength=len(self.place_rows)) / self._place_weights
-        if allowed is not None:
-            shares = np.where(allowed, shares, 0.0)
-        best = np.argsort(-shares, kind="stable")[:top]
-        return np.asarray(best[shares[best] > 0.0], np.int64)
+        return np.asarray(shares)
 
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
@@ -138,6 +135,13 @@ class MapView:
         """Rows of all landmarks of places near one place with a similar viewing direction."""
         near = places_around(self.map_from_cam, self.map_from_cam[place], _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
         return np.unique(self._shown[near[self._place_of_shown]])
+
+
+def most_similar(similarities: Array, allowed: NDArray[np.bool_] | None, top: int) -> Rows:
+    """Return at most `top` of the allowed places (K,) with any similarity, best first."""
+    shares = similarities if allowed is None else np.where(allowed, similarities, 0.0)
+    best = np.argsort(-shares, kind="stable")[:top]
+    return np.asarray(best[shares[best] > 0.0], np.int64)
 
 
 def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: Rows) -> Rows:

@@ -14,7 +14,7 @@ from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, rans
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import Rows, places_around
-from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView
+from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView, most_similar
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import TimeSliced
@@ -132,7 +132,7 @@ class Relocalizer:
             if tried:
                 yield
             tried.append(map_from_place)
-            fix = self._at_place(query, int(place), map_from_cam_rotation)
+            fix = self.at_place(query, int(place), map_from_cam_rotation)
             if fix is None:
                 failed.append(map_from_place)
             elif _is_new(fix, fixes):
@@ -195,21 +195,26 @@ class Relocalizer:
 
     def _ranked(self, query: FrameFeatures, allowed: NDArray[np.bool_] | None, failed: list[Array]) -> Rows:
         """Places to try, the most similar first; without failed ones and neighbourhoods of several failures, unless none else is left."""
-        top = _RANKED * self._settings.fix.top_places
+        top, similarities = _RANKED * self._settings.fix.top_places, self.similarities(query)
         if not failed:
-            return self.view.similar_places(query.features.descriptors, allowed, top)
+            return most_similar(similarities, allowed, top)
         map_from_cam = self.view.map_from_cam
         around = [places_around(map_from_cam, place, SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
         is_tried = np.any([(map_from_cam == place).all(axis=(1, 2)) for place in failed], axis=0)
         is_open = ~is_tried & (np.sum(around, axis=0) < _TRIALS_AT_A_PLACE)
         is_wanted = is_open if allowed is None else allowed & is_open
-        places = self.view.similar_places(query.features.descriptors, is_wanted, top)
+        places = most_similar(similarities, is_wanted, top)
         if len(places):
             return places
         failed.clear()
-        return self.view.similar_places(query.features.descriptors, allowed, top)
+        return most_similar(similarities, allowed, top)
 
-    def _at_place(self, query: FrameFeatures, place: int, rotation: Array | None) -> Fix | None:
+    def similarities(self, query: FrameFeatures) -> Array:
+        """Return (K,) how similar each place of the view is to a frame."""
+        return self.view.similarities(query.features.descriptors)
+
+    def at_place(self, query: FrameFeatures, place: int, rotation: Array | None) -> Fix | None:
+        """Find the fix by recognized landmarks around one place; rotation (3, 3): the camera's in the map, None if unknown."""
         settings = self._settings.fix
         rows = self.view.neighbourhood(place)
         pairs = match_mutual(
@@ -244,27 +249,35 @@ class Relocalizer:
 
     def _with_aliases(self, query: FrameFeatures, fixes: list[Fix]) -> TimeSliced[list[Fix]]:
         """Return the fixes, and those at the aliases of the best one."""
-        settings, view, best = self._settings.fix, self.view, fixes[0]
+        best = fixes[0]
         if best.matches is None:
             return fixes
-        features, rows = best.matches.T
-        seen = LandmarkSet(view.points_map[rows], query.features.descriptors[features])
-        landmarks = LandmarkSet(view.points_map, view.descriptors)
-        limits = (settings.alias_votes_share, settings.most_aliases)
-        aliases = yield from find_aliases(seen, landmarks, best.map_from_cam, *limits)
+        aliases = yield from self.aliases_of(query, best)
         fixes = [replace(best, alias_ratio=max((a.alias_ratio for a in aliases), default=0.0)), *fixes[1:]]
         for alias in aliases:
             if _count_at([fix.map_from_cam for fix in fixes], alias.map_from_cam):
                 continue
             yield
-            fix = self._at_alias(query, alias, features)
+            fix = self.at_alias(query, alias, best)
             if fix is not None and _is_new(fix, fixes):
                 fixes.append(fix)
         return fixes
 
-    def _at_alias(self, query: FrameFeatures, alias: AliasCandidate, features: NDArray[np.int64]) -> Fix | None:
+    def aliases_of(self, query: FrameFeatures, fix: Fix) -> TimeSliced[list[AliasCandidate]]:
+        """Return the places that look like that of a fix with matches, best first."""
+        assert fix.matches is not None
+        settings, view = self._settings.fix, self.view
+        features, rows = fix.matches.T
+        seen = LandmarkSet(view.points_map[rows], query.features.descriptors[features])
+        landmarks = LandmarkSet(view.points_map, view.descriptors)
+        limits = settings.alias_votes_share, settings.most_aliases
+        return (yield from find_aliases(seen, landmarks, fix.map_from_cam, *limits))
+
+    def at_alias(self, query: FrameFeatures, alias: AliasCandidate, seen: Fix) -> Fix | None:
+        """Find the fix at an alias of another one, `seen`, with matches."""
+        assert seen.matches is not None
         settings = self._settings.fix
-        matched = self._matched(query, features[alias.features], alias.landmarks)
+        matched = self._matched(query, seen.matches[alias.features, 0], alias.landmarks)
         found = self._with_rotation(matched, alias.map_from_cam[:3, :3], settings.min_inliers // 3)
         if found is None:
             return self.by_projection(query, alias.map_from_cam, settings.max_radius_px)

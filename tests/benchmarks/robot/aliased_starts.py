@@ -19,7 +19,7 @@ from fleetsim.recorder import Order, Session, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 from mapserver.drafting.draft_evidence import PROBES
-from mapserver.quality.probes import Probe, starts_without_prior
+from mapserver.quality.probes import Probe, fixes_of, starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import choose_landmarks
@@ -91,7 +91,7 @@ def measured_lookalikes(view: MapView, survey: EstimatorSession) -> LookAlikes |
     numbers = np.linspace(0, len(survey) - 1, PROBES).round().astype(int).tolist()
     places = [survey.map_from_body[number] @ survey.body_from_cam for number in numbers]
     probes = [Probe(survey.camera, estimator_loop.seen(survey, n), at) for n, at in zip(numbers, places, strict=True)]
-    starts = starts_without_prior(view, probes)
+    starts = starts_without_prior([fixes_of(view, probe) for probe in probes])
     if starts is None:
         return None
     return LookAlikes(starts.lookalike_recall, starts.max_wrong_share, float(starts.lookalike_inliers or 0))

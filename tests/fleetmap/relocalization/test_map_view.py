@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import MapView, most_similar
 from fleetmap.sensors.rectification import StereoCamera
 from support.storage.map_samples import random_tile
 from support.worlds.vocabulary_training import train_vocabulary
@@ -59,11 +59,13 @@ def test_a_place_is_found_by_the_share_of_it_that_is_seen() -> None:
     view = MapView([tile], train_vocabulary(tile.descriptors, 10, 4, rng), SURVEY_FOCAL_PX)
     clutter = rng.integers(0, 256, (600, 32), np.uint8)
     for place, rows in enumerate(view.place_rows):
-        found = view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), None, 3)
+        found = most_similar(view.similarities(np.concatenate([clutter, view.descriptors[rows]])), None, 3)
         assert found[0] == place
         flips = np.packbits(np.argsort(rng.random((len(rows), 256)), axis=1) < 25, axis=1)  # another day
         days_later = np.concatenate([clutter, view.descriptors[rows] ^ flips])
-        assert view.similar_places(days_later, None, 1).tolist() == [place]
+        assert most_similar(view.similarities(days_later), None, 1).tolist() == [place]
         others = np.arange(len(view.place_rows)) != place
-        assert place not in view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), others, 3)
-    assert len(view.similar_places(np.zeros((0, 32), np.uint8), None, 3)) == 0
+        assert place not in most_similar(
+            view.similarities(np.concatenate([clutter, view.descriptors[rows]])), others, 3
+        )
+    assert len(most_similar(view.similarities(np.zeros((0, 32), np.uint8)), None, 3)) == 0

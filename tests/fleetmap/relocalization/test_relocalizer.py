@@ -24,7 +24,7 @@ PLACES = 20
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The places that are tried, none of which verifies."""
     places: list[int] = []
-    monkeypatch.setattr(Relocalizer, "_at_place", lambda _, query, place, rotation: places.append(place))
+    monkeypatch.setattr(Relocalizer, "at_place", lambda _, query, place, rotation: places.append(place))
     return places
 
 

@@ -6,7 +6,7 @@ import pytest
 from fleetmap.relocalization.map_view import ALIAS_STEP_M
 from fleetmap.relocalization.relocalizer import SAME_PLACE_M
 from mapserver.quality.figures import Repetition
-from mapserver.quality.probes import Probe, alias_step_m, repetition
+from mapserver.quality.probes import Probe, alias_step_m, fixes_of, repetition
 from support.worlds.aisle_world import BODY_FROM_CAM, CAMERA, Aisle, aisle, drive, frame, relocalizer
 
 
@@ -30,7 +30,8 @@ def measured(seen: Aisle) -> Repetition | None:
     view = relocalizer(seen, places)[0].view
     between = places[5:45:2].copy()
     between[:, 0, 3] += 0.2
-    return repetition(view, [Probe(CAMERA, frame(seen, place, rng), place @ BODY_FROM_CAM) for place in between])
+    probes = [Probe(CAMERA, frame(seen, place, rng), place @ BODY_FROM_CAM) for place in between]
+    return repetition([fixes_of(view, probe) for probe in probes])
 
 
 @pytest.mark.parametrize("bay_m", [1.8, 2.7, 3.6])
@@ -44,7 +45,7 @@ def test_a_fix_that_is_off_by_less_than_an_alias_is_no_alias() -> None:
     view = relocalizer(seen, places)[0].view
     aside = places[20] @ BODY_FROM_CAM
     aside[0, 3] += 0.6
-    assert repetition(view, [Probe(CAMERA, frame(seen, places[20], rng), aside)]) == Repetition(1, None)
+    assert repetition([fixes_of(view, Probe(CAMERA, frame(seen, places[20], rng), aside))]) == Repetition(1, None)
 
 
 def test_an_aisle_whose_places_differ_repeats_nothing() -> None:
