@@ -12,10 +12,9 @@ from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, square
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
-from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.fleet.alerts import with_acts
 from mapserver.floor_plan.alignment import Alignment
-from mapserver.floor_plan.areas import Area, Areas
+from mapserver.floor_plan.areas import Area, Areas, due_corrections
 from mapserver.floor_plan.survey_requests import courses
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
@@ -127,9 +126,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
 def _waiting(maps: MapData, site: str) -> Sequence[Area]:
     """The areas to be learned anew that the current version has not forgotten yet."""
     current = maps.current_version(site)
-    if current is None:
-        return []
-    return AreaCorrections.of(maps.store.areas(site), maps.store.manifest(site, current)).due
+    return [] if current is None else due_corrections(maps.store.areas(site), maps.store.manifest(site, current))
 
 
 def _used(services: Services, rows: SiteReleases) -> str:

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from fleetmap.encoding import to_json
 from fleetmap.geometry import AnyArray, Array, Rings, inside_any
 from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.draft_evidence import Before
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
-from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas
+from mapserver.floor_plan.areas import CORRECTIONS_KEY, Area, Areas, CorrectionKind, due_corrections
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, near_drives
 from mapserver.survey.merge.changes import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
@@ -24,15 +23,6 @@ from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Mask
 from mapserver.survey.survey_map import SurveyMap
-
-CORRECTIONS_KEY = "corrections"
-"""Key in `configuration` of a manifest with the corrections that a version has, as GeoJSON; older readers ignore it."""
-
-
-def corrections_of(manifest: Manifest) -> Areas:
-    """Return the corrections that a version has. UsageError for invalid ones."""
-    found = manifest.configuration.get(CORRECTIONS_KEY)
-    return read_areas(to_json(found), None) if found else Areas()
 
 
 def _of(areas: Iterable[Area], kind: CorrectionKind) -> list[Area]:
@@ -53,9 +43,7 @@ class AreaCorrections:
     @classmethod
     def of(cls, areas: Areas, manifest: Manifest) -> "AreaCorrections":
         """Return the corrections of a site's areas for a build on a version."""
-        done = {area.correction.since_ns for area in corrections_of(manifest).areas if area.correction}
-        forget = _of(areas.areas, CorrectionKind.FORGET)
-        return cls(areas.corrections, [a for a in forget if a.correction and a.correction.since_ns not in done])
+        return cls(areas.corrections, due_corrections(areas, manifest))
 
     def joined(
         self, base: SurveyMap | None, surveyed: Sequence[RecordingSurvey], settings: SurveySettings

@@ -13,13 +13,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.encoding import decode_json, to_plain
+from fleetmap.encoding import decode_json, to_json, to_plain
 from fleetmap.errors import InvalidValueError, StateError
 from fleetmap.geometry import Array, Rings, inside_any, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.manifest import Manifest
 
 OUTSIDE = "outside"
 """Key of counts outside of all areas and tiles."""
+
+CORRECTIONS_KEY = "corrections"
+"""Key in `configuration` of a manifest with the corrections that a version has, as GeoJSON; older readers ignore it."""
 
 MAX_AREAS_BYTES = 8 << 20
 _MAX_AREAS, _MAX_CORNERS, _MAX_RING = 2000, 50_000, 2000
@@ -271,6 +275,19 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
             raise InvalidValueError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
         areas[area.name] = area
     return Areas.of(list(areas.values()), collection.frame)
+
+
+def corrections_of(manifest: Manifest) -> Areas:
+    """Return the corrections that a version has. UsageError for invalid ones."""
+    found = manifest.configuration.get(CORRECTIONS_KEY)
+    return read_areas(to_json(found), None) if found else Areas()
+
+
+def due_corrections(areas: Areas, manifest: Manifest) -> list[Area]:
+    """Return the areas to be learned anew that a version has not forgotten yet."""
+    done = {area.correction.since_ns for area in corrections_of(manifest).areas if area.correction}
+    wanted = [(area, area.correction) for area in areas.areas if area.correction is not None]
+    return [area for area, word in wanted if word.kind is CorrectionKind.FORGET and word.since_ns not in done]
 
 
 def _area(feature: _Feature, map_from_drawn: Array) -> Area:

@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 from urllib.parse import quote
 
-import sqlite_utils
-
 from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from mapserver.store import files
 from mapserver.store.rows import NOBODY, UNLIMITED, Actor, AuditLine
-from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES, names
+from mapserver.store.schema import FIRST_FORMAT, FORMAT, MIGRATIONS, TABLES, names
 
 APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
 NUL = r"\x00"
@@ -393,8 +391,10 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> int:
 
 
 def _migrate(connection: sqlite3.Connection) -> None:
-    # The pending ones: another process may have run some
-    MIGRATIONS.apply(sqlite_utils.Database(connection, execute_plugins=False))
+    """Run the pending migrations: another process may have run some."""
+    (number,) = connection.execute("PRAGMA user_version").fetchone()
+    for migration in MIGRATIONS[max(0, number - FIRST_FORMAT) :]:
+        migration(connection)
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {FORMAT}")
 

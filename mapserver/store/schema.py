@@ -1,13 +1,13 @@
 """The tables of the database, most with a column for each field of a record in `rows`.
 
-A change is a further named migration; a released one is never changed.
+A change is a further migration; a released one is never changed.
 """
 
+from collections.abc import Callable
 from dataclasses import fields
+from sqlite3 import Connection
 from types import NoneType
 from typing import get_args
-
-from sqlite_utils import Database, Migrations
 
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.store.rows import (
@@ -21,7 +21,6 @@ from mapserver.store.rows import (
     VersionInfo,
 )
 
-MIGRATIONS = Migrations("fleetmap")
 _OF_VERSION = "FOREIGN KEY (site, version) REFERENCES versions(site, version)"
 _TYPES = {int: "INTEGER", bool: "INTEGER", str: "TEXT", float: "REAL", bytes: "BLOB"}
 
@@ -115,22 +114,23 @@ def statements(compact: str = " WITHOUT ROWID") -> list[str]:
     return made + INDEXES
 
 
-@MIGRATIONS()
-def tables(database: Database) -> None:
+def _make_tables(connection: Connection) -> None:
     """Create the first schema."""
     for statement in statements():
-        database.execute(statement)
+        connection.execute(statement)
     for name, change, words in (
         ("events_are_kept", "DELETE", "shortened"),
         ("events_stay_as_they_are", "UPDATE", "changed"),
     ):
-        database.execute(
+        connection.execute(
             f"""CREATE TRIGGER {name} BEFORE {change} ON events
                 BEGIN SELECT RAISE(ABORT, 'the log of events is never {words}'); END"""
         )
 
 
-FORMAT = 12 + len(MIGRATIONS.pending(Database(memory=True)))  # there were 12 before migrations had names
+MIGRATIONS: list[Callable[[Connection], None]] = [_make_tables]
+FIRST_FORMAT = 12  # before the first migration
+FORMAT = FIRST_FORMAT + len(MIGRATIONS)
 """SQLite's user_version of a database with all migrations: reveals an older database by its header, and is newer for older programs."""
 
 

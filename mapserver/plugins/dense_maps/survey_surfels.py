@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
@@ -196,7 +196,7 @@ class SurfelGrower:
         ]
         new, old = np.array(lights).reshape(-1, EXPOSURE), before.exposures
         if len(new) and len(old):
-            old = old[cKDTree(new[:, :3]).query(old[:, :3])[0] > _OWN_LIGHT_M]
+            old = old[scipy.spatial.cKDTree(new[:, :3]).query(old[:, :3])[0] > _OWN_LIGHT_M]
         return tuple(exposure.falloff.round(6).tolist()), np.concatenate([new, old])
 
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
+import scipy
 from numpy.typing import NDArray
 
 from fleetmap import core

@@ -6,8 +6,8 @@ Left out are duplicate or inaccurate landmarks, and redundant keyframes.
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fleetmap import core
 from fleetmap.features.matching import packed
@@ -143,7 +143,7 @@ def _duplicates(
     marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
 ) -> NDArray[np.bool_]:
     """Return (N,) landmarks at the position of a better observed similar one, never seen beside it."""
-    near = cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
+    near = scipy.spatial.cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
     if not len(near):
         return np.zeros(len(marks.points_map), bool)
     near, first = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64), marks.firsts

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
@@ -95,8 +95,8 @@ def find_groups(state: SurveyState, sigmas_m: SigmaBetween, join_sigma_m: float)
     """Return the same before loops are closed: there may be many groups, and none is chosen."""
     marks, seeing = state.landmarks, _seeing(state)
     ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(seeing), len(marks.points_map))
-    seen = csr_matrix((ones, (marks.obs_keyframe, marks.obs_landmark)), shape)
-    shared = coo_matrix(seen @ seen.T)
+    seen = scipy.sparse.csr_matrix((ones, (marks.obs_keyframe, marks.obs_landmark)), shape)
+    shared = scipy.sparse.coo_matrix(seen @ seen.T)
     enough = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
     pairs = zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True)
     return KeyframeGroups([*pairs, *bridges(seeing, sigmas_m, join_sigma_m)], len(seeing))

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import betaincinv
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
@@ -67,7 +66,7 @@ def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
     known = np.flatnonzero(np.isfinite(pixels[:, 2]))
     if not len(known) or not len(expected.rows):
         return fits
-    away_px, nearest = cKDTree(pixels[known, :2]).query(expected.pixels[:, :2])
+    away_px, nearest = scipy.spatial.cKDTree(pixels[known, :2]).query(expected.pixels[:, :2])
     measured = (pixels[:, 0] - pixels[:, 2])[known[nearest]]
     disparity = expected.pixels[:, 0] - expected.pixels[:, 2]
     hidden = (away_px < _BESIDE_PX) & (measured > disparity + np.maximum(2.0, 0.15 * disparity))
@@ -123,6 +122,6 @@ def confirmation(
     alone = share * (1.0 - share) / count
     effective = count * min(1.0, alone / clustered) if clustered > 0 else float(count)
     k = share * effective
-    low = float(betaincinv(k, effective - k + 1, error_rate)) if k > 0 else 0.0
-    high = float(betaincinv(k + 1, effective - k, 1.0 - error_rate)) if k < effective else 1.0
+    low = float(scipy.special.betaincinv(k, effective - k + 1, error_rate)) if k > 0 else 0.0
+    high = float(scipy.special.betaincinv(k + 1, effective - k, 1.0 - error_rate)) if k < effective else 1.0
     return Confirmation(count, int(is_seen.sum()), len(off), low, high, error_rate)

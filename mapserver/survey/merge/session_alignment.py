@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse, turn_both
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -96,7 +96,9 @@ def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, c
     numbers = np.array([fix.k for fix in fixes])
     predicted = se3_inverse(survey_from_body[own.k]) @ survey_from_body[numbers]
     off = measured @ se3_inverse(predicted)
-    innovation = np.column_stack([Rotation.from_matrix(off[:, :3, :3]).as_rotvec(), off[:, :3, 3]])
+    innovation = np.column_stack(
+        [scipy.spatial.transform.Rotation.from_matrix(off[:, :3, :3]).as_rotvec(), off[:, :3, 3]]
+    )
     near = np.flatnonzero((np.linalg.norm(innovation[:, :3], axis=1) < _ANY_TURN_RAD) & (numbers != own.k))
     covariances = chain.relative_covs(own.k, numbers[near])
     best: dict[int, tuple[float, int]] = {}

@@ -8,8 +8,7 @@ matrix products without factorisation, and an accepted loop is an update. First 
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
-from scipy.spatial.transform import Rotation
+import scipy
 
 from fleetmap.features.matching import Indices
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, so3_left_jacobian
@@ -152,7 +151,7 @@ def _chain_and_others(count: int, edges: Sequence[PoseEdge]) -> tuple[list[PoseE
 
 def _moved(map_from_body: Array, perturbations: Array) -> Array:
     """Return Exp(x_k) @ map_from_body (K, 4, 4) for perturbations (K, 6), to second order in the translation."""
-    turns = Rotation.from_rotvec(perturbations[:, :3]).as_matrix()
+    turns = scipy.spatial.transform.Rotation.from_rotvec(perturbations[:, :3]).as_matrix()
     shifts = perturbations[:, 3:] + 0.5 * np.cross(perturbations[:, :3], perturbations[:, 3:])
     moved = map_from_body.copy()
     moved[:, :3, :3] = turns @ map_from_body[:, :3, :3]

@@ -1,17 +1,23 @@
-"""Pose graph optimization over SE(3): the best fit of poses to measured relative transforms, and the outlier loops."""
+"""Pose graph optimization over SE(3): the best fit of poses to measured relative transforms, and the outlier loops.
+
+gtsam is imported where it is used: a tenth of a second that builds without loops do not need.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.special import gammaincinv
+import scipy
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse
+
+if TYPE_CHECKING:
+    import gtsam
 
 _FIXED_SIGMA = 1e-6
 _INLIER_PROBABILITY = 0.999
@@ -60,6 +66,8 @@ def optimize_pose_graph(map_from_body: Array, edges: Sequence[PoseEdge], *, robu
     tried, and the better result returned. Raises SurveyError for edges that leave a keyframe unconnected, have an invalid index or an
     invalid covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as in gtsam.
     """
+    import gtsam
+
     check_edges(len(map_from_body), edges)
     start = gtsam.Values()
     for k, map_from_k in enumerate(map_from_body):
@@ -70,7 +78,7 @@ def optimize_pose_graph(map_from_body: Array, edges: Sequence[PoseEdge], *, robu
         if robust and loops:
             certain = _graph(map_from_body, [edge for edge in edges if not edge.is_loop])
             # chi-square; scipy.stats takes half a second to import
-            bound = float(2.0 * gammaincinv(3.0, _INLIER_PROBABILITY))
+            bound = float(2.0 * scipy.special.gammaincinv(3.0, _INLIER_PROBABILITY))
             weights, start = loop_weights(certain, [_factor(edge) for edge in loops], start, bound)
         believed = iter(weights >= 0.5)
         kept = [edge for edge in edges if not edge.is_loop or next(believed)]
@@ -111,7 +119,8 @@ def check_edges(count: int, edges: Sequence[PoseEdge], *, connected: bool = True
     if not connected:
         return
     ends = np.array([(edge.i, edge.j) for edge in edges], np.int64).reshape(-1, 2).T
-    _, part = connected_components(coo_array((np.ones(len(edges)), ends), (count, count)), directed=False)
+    joined = scipy.sparse.coo_array((np.ones(len(edges)), ends), (count, count))
+    _, part = scipy.sparse.csgraph.connected_components(joined, directed=False)
     lost = np.flatnonzero(part != part[:1]).tolist()
     if lost:
         raise SurveyError(f"keyframes {lost[:10]} ({len(lost)} in all) have no edge towards keyframe 0; leave them out")
@@ -129,6 +138,8 @@ def _is_covariance(cov: Array) -> bool:
 
 def _graph(map_from_body: Array, edges: Sequence[PoseEdge]) -> gtsam.NonlinearFactorGraph:
     """Return the edges as factors, in order, then the factor that fixes the first keyframe."""
+    import gtsam
+
     graph = gtsam.NonlinearFactorGraph()
     for edge in edges:
         graph.add(_factor(edge))
@@ -138,6 +149,8 @@ def _graph(map_from_body: Array, edges: Sequence[PoseEdge]) -> gtsam.NonlinearFa
 
 
 def _factor(edge: PoseEdge) -> gtsam.NoiseModelFactor:
+    import gtsam
+
     j_from_i = se3_adjoint(se3_inverse(edge.i_from_j))  # gtsam perturbs on the right, in the axes of j
     cov = j_from_i @ edge.cov_rot_trans @ j_from_i.T
     noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (cov + cov.T))
@@ -199,6 +212,8 @@ def improved(
     steps: int,
 ) -> gtsam.Values:
     """Return the values after some steps of Levenberg-Marquardt with weighted loops."""
+    import gtsam
+
     graph = gtsam.NonlinearFactorGraph(certain)
     for loop, weight in zip(loops, weights, strict=True):
         if weight >= 1.0 - _UNSURE:
@@ -213,6 +228,8 @@ def improved(
 
 def descended(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, steps: int) -> tuple[gtsam.Values, int]:
     """Return the values after at most `steps` of Levenberg-Marquardt, and their number."""
+    import gtsam
+
     settings = gtsam.LevenbergMarquardtParams()
     settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
     settings.setMaxIterations(steps)

@@ -3,12 +3,18 @@
 A similarity maps x to scale * R x + t; keyframe k has map_from_k.
 """
 
-import gtsam
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.special import gammaincinv
+import scipy
 
 from fleetmap.geometry import Array, transform_points
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges, improved, squared_residuals
+
+if TYPE_CHECKING:
+    import gtsam
 
 _FIXED_SIGMA = 1e-6
 _INLIER_PROBABILITY = 0.999
@@ -62,6 +68,8 @@ def solve_scaled(
     all other edges assumed true: by graduated non-convexity with Geman and McClure's cost, which accepts all loops at first; one with a
     squared residual within 0.999 of chi-square counts in full. SurveyError as `check_edges`. Source: Yang et al. 2020 (GNC).
     """
+    import gtsam
+
     check_edges(len(map_from_body), [*chain, *loops])
     state, certain = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k, placed in enumerate(map_from_body):
@@ -74,7 +82,7 @@ def solve_scaled(
     weights = np.ones(len(loops))
     state = improved(certain, doubtful, weights, state, _MAX_ITERATIONS)
     if loops:
-        limit = float(2.0 * gammaincinv(3.5, _INLIER_PROBABILITY))  # chi-square of seven freedoms
+        limit = float(2.0 * scipy.special.gammaincinv(3.5, _INLIER_PROBABILITY))  # chi-square of seven freedoms
         squares = squared_residuals(doubtful, state)
         control = max(2.0 * float(squares.max()) / limit, 1.0)
         while True:
@@ -100,6 +108,8 @@ def _factor(edge: PoseEdge, log_scale: float, sigma: float) -> gtsam.NoiseModelF
 
     gtsam's Similarity3(R, t, s) maps x to s (R x + t), and its errors are in the axes of j.
     """
+    import gtsam
+
     scale = float(np.exp(log_scale))
     carry = np.diag([1.0] * 3 + [scale] * 3)
     cov = np.zeros((7, 7))

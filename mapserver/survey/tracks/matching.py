@@ -5,8 +5,8 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from mapserver.survey.executor import SERIAL, Executor, in_batches
@@ -101,7 +101,7 @@ class NearPlaces:
         self._positions_m, self._reach_m = positions_m, reach_m
         levels = np.ceil(np.log2(np.maximum(reach_m, 1e-3)))
         numbers = [np.flatnonzero(levels == level) for level in np.unique(levels)]
-        self._trees = [(own, cKDTree(positions_m[own]), float(reach_m[own].max())) for own in numbers]
+        self._trees = [(own, scipy.spatial.cKDTree(positions_m[own]), float(reach_m[own].max())) for own in numbers]
 
     def before(self, j: int, until: int) -> NDArray[np.int64]:
         """Return ascending numbers below `until` of all that may reach j or be reached from it."""

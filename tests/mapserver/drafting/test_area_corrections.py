@@ -9,8 +9,8 @@ import pytest
 
 from fleetmap.geometry import inside_any
 from fleetmap.sensors.samples import Trajectory
-from mapserver.drafting.area_corrections import AreaCorrections, corrections_of
-from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind
+from mapserver.drafting.area_corrections import AreaCorrections
+from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind, corrections_of
 from mapserver.quality.gate import GateSettings, judge
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.changes import SurveyLimits, is_before
