@@ -12,6 +12,7 @@
 #   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
+#   make profile               where the CPU time of a build and of a robot's frame goes, into docs/performance.md (RECORDING=PATH: of its build)
 #   make study NAME=warehouse  an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make clean                 remove everything that the other verbs made
 
@@ -36,7 +37,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core compiled demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance study clean
+.PHONY: help core compiled demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance profile study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -113,6 +114,9 @@ bench: core
 
 acceptance: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
+
+profile: core
+	PYTHONPATH=tests $(BIN)/python tests/benchmarks/profiled.py $(RECORDING)
 
 study: core
 	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=warehouse"; exit 2; }
