@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -112,8 +114,7 @@ def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> E
     # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
     if radius_95_m(known.now.cov_rot_trans) <= settings.lost_radius_m:
         status = Status.DEGRADED
-    estimate = replace(estimate, status=status, cause=_cause(estimate, has_failed=True))
-    return _with_pose(estimate, known.now, settings)
+    return _with_pose(estimate, known.now, settings, status=status, cause=_cause(estimate, has_failed=True))
 
 
 def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
@@ -144,25 +145,26 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
         status = Status.DEGRADED
     else:
         status, cause = Status.TRACKING, Cause.NONE
-    estimate = replace(estimate, status=status, cause=cause)
     if status is not Status.TRACKING and told:  # the robot may be at either
-        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=_published([confirmed, *elsewhere]))
-    return _with_pose(estimate, confirmed.now, settings)
+        hypotheses = _published([confirmed, *elsewhere])
+        return replace(estimate, status=Status.AMBIGUOUS, cause=cause, hypotheses=hypotheses)
+    return _with_pose(estimate, confirmed.now, settings, status=status, cause=cause)
 
 
+@lru_cache(maxsize=1)
 def map_cov(settings: TrackSettings) -> Array:
     """Return the covariance (6, 6) of the map itself at a place, rotation first."""
     return np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
 
 
-def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings) -> Estimate:
-    """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out.
+def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings, **changes: Any) -> Estimate:
+    """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out, beside other changes.
 
     The estimate has no pose if pose or covariance contain NaN.
     """
-    if np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any():
-        return estimate
-    return replace(estimate, **place._replace(cov_rot_trans=place.cov_rot_trans + map_cov(settings))._asdict())
+    if not (np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any()):
+        changes |= place._replace(cov_rot_trans=place.cov_rot_trans + map_cov(settings))._asdict()
+    return replace(estimate, **changes)
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:

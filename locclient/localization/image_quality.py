@@ -1,11 +1,13 @@
 """Image quality of a frame: exposure, sharpness, and faults. Pure."""
 
+from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass, replace
 from math import sqrt
-from statistics import median
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from fleetmap import core
 from fleetmap.config import Section
@@ -24,7 +26,7 @@ class ImageQualitySettings(Section, frozen=True):
     dark_contrast: float = 4.0
     glare_share: float = 0.6
     blurred_share: float = 0.1
-    typical_frames: int = 150  # for the average contrast and depth
+    typical_frames: Annotated[int, Meta(ge=1)] = 150  # for the average contrast and depth
     occluded_depth_share: float = 0.4
 
 
@@ -49,10 +51,9 @@ class ImageQualityMonitor:
 
     def __init__(self, settings: ImageQualitySettings) -> None:
         self._settings = settings
-        self._last: list[Image | None] = [None, None]
+        self._last = [b"", b""]
         self._frozen = [False, False]
-        self._sharpness: deque[float] = deque(maxlen=settings.typical_frames)
-        self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
+        self._sharpness, self._depths_m = (_Latest(settings.typical_frames) for _ in range(2))
 
     def judge(self, frame: RectifiedFrame | CameraFrame) -> ImageQuality:
         """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
@@ -60,12 +61,12 @@ class ImageQualityMonitor:
         self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
         count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
         variance = squares / count - (total / count) ** 2
-        typical = median(self._sharpness) if self._sharpness else variance
+        typical = self._sharpness.median(variance)
         cause = self._exposure_fault(thinned[0])
         if cause is Cause.NONE and any(self._frozen):
             cause = Cause.FROZEN
         if cause is Cause.NONE:
-            self._sharpness.append(variance)
+            self._sharpness.add(variance)
             cause = Cause.BLURRED if variance < self._settings.blurred_share * typical else Cause.NONE
         return ImageQuality(cause, thinned[0].mean / 255.0, variance / max(typical, 1e-9))
 
@@ -76,10 +77,9 @@ class ImageQualityMonitor:
 
     def judge_depth(self, scene_depth_m: float) -> Cause:
         """Return OCCLUDED if the scene is much nearer than usual: an object is in front of the cameras."""
-        typical_m = median(self._depths_m) if self._depths_m else scene_depth_m
-        if scene_depth_m < self._settings.occluded_depth_share * typical_m:
+        if scene_depth_m < self._settings.occluded_depth_share * self._depths_m.median(scene_depth_m):
             return Cause.OCCLUDED
-        self._depths_m.append(scene_depth_m)
+        self._depths_m.add(scene_depth_m)
         return Cause.NONE
 
     def _exposure_fault(self, left: "_ThinnedImage") -> Cause:
@@ -90,14 +90,14 @@ class ImageQualityMonitor:
     def _is_frozen(self, side: int, image: "_ThinnedImage") -> bool:
         """Return True for an image that is bit-identical to the last one: sensor noise never repeats."""
         last, self._last[side] = self._last[side], image.pixels
-        return last is not None and image.contrast > 1.0 and np.array_equal(last, image.pixels)
+        return image.contrast > 1.0 and last == image.pixels
 
 
 @dataclass(frozen=True, slots=True)
 class _ThinnedImage:
     """Every eighth pixel of every eighth row, with mean, standard deviation and share of nearly white pixels."""
 
-    pixels: Image
+    pixels: bytes
     mean: float
     contrast: float
     bright_share: float
@@ -105,5 +105,22 @@ class _ThinnedImage:
     @classmethod
     def of(cls, image: Image) -> "_ThinnedImage":
         pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
-        mean = total / pixels.size
-        return cls(pixels, mean, sqrt(max(squares / pixels.size - mean * mean, 0.0)), brights / pixels.size)
+        mean, count = total / len(pixels), len(pixels)
+        return cls(pixels, mean, sqrt(max(squares / count - mean * mean, 0.0)), brights / count)
+
+
+class _Latest:
+    """The last values of a figure, also in order of size."""
+
+    def __init__(self, count: int) -> None:
+        self._values, self._in_order = deque[float](maxlen=count), list[float]()
+
+    def add(self, value: float) -> None:
+        if len(self._values) == self._values.maxlen:
+            del self._in_order[bisect_left(self._in_order, self._values[0])]
+        self._values.append(value)
+        insort(self._in_order, value)
+
+    def median(self, default: float) -> float:
+        known, count = self._in_order, len(self._in_order)
+        return (known[(count - 1) // 2] + known[count // 2]) / 2 if known else default

@@ -155,12 +155,11 @@ class Localizer:
             view_causes=percept.view_causes,
             view=self._query.view,
             floor=tracker.floor,
+            calibration=percept.calibration,
             **result._asdict(),
         )
         estimate = assemble(estimate, tracker, has_failed=self._query.failed > 0)
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self.maps.version_on(estimate.floor))
         fixed_ns = None if tracker.confirmed is None or percept.is_reversed else tracker.confirmed.stamp_ns
-        return with_calibration(
-            estimate, percept.calibration, self._mounting, fixed_ns, was_localized=tracker.was_tracking
-        )
+        return with_calibration(estimate, self._mounting, fixed_ns, was_localized=tracker.was_tracking)

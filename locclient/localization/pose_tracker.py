@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fleetmap.failure_definition import radius_95_m
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -212,11 +212,10 @@ class PoseTracker:
         self._period_ns = min(self._period_ns, step_ns)
         if last is not None and change is not None:
             last = change @ last
-        step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
-        if odometry.previous_from_body is not None:
-            step = odometry.previous_from_body
-        elif (before := dict(odometry.revised).get(odometry.frame_index - 1)) is not None:
-            step = se3_inverse(before) @ odometry.odom_from_body
+        before = dict(odometry.revised).get(odometry.frame_index - 1, last)
+        step = odometry.previous_from_body
+        if step is None:
+            step = np.eye(4) if before is None else se3_inverse(before) @ odometry.odom_from_body
         for hypothesis in self._tracked():
             hypothesis.propagate(motions, odometry, step, self.settings)
             hypothesis.has_broken |= has_broken
@@ -227,7 +226,7 @@ class PoseTracker:
         if change is not None:
             self.candidates.redefine_odom(change)
         self.odom_from_body = odometry.odom_from_body
-        self.step_m = float(np.linalg.norm(step[:3, 3]))
+        self.step_m = length(step[:3, 3])
         if self.prior is not None:
             self.prior.travelled_m += self.step_m
 

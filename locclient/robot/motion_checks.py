@@ -8,7 +8,7 @@ from math import dist, hypot
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, length, se3_inverse, so3_exp, so3_log
 from fleetmap.messages import Flag, Status
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
@@ -165,7 +165,7 @@ class WheelAgreement:
     """
 
     def __init__(self, base_from_body: Array) -> None:
-        self._base_from_body = base_from_body
+        self._base_from_body, self._body_from_base = base_from_body, se3_inverse(base_from_body)
         self._last_ns: int | None = None
         self._rolled = list[WheelSample]()  # since the last way that images have shown
         self._against_m = 0.0
@@ -180,8 +180,10 @@ class WheelAgreement:
     @property
     def refused(self) -> dict[Flag, str]:
         """Return the flag of RobotHealth with its text; empty unless the wheels are refused."""
+        if not self.is_refused:
+            return {}
         fault = speed_in_words(self.ratio) or "their speed contradicts the images and the IMU"
-        return {Flag.WHEELS_REFUSED: f"the wheels are left out: {fault}"} if self.is_refused else {}
+        return {Flag.WHEELS_REFUSED: f"the wheels are left out: {fault}"}
 
     def favours(self, turn_rad: float) -> bool | None:
         """Return whether the wheels say that the images' motion is turned by this angle; None if unknown."""
@@ -200,8 +202,9 @@ class WheelAgreement:
             self.is_doubted &= not self._is_compared  # in the dark, wheels that agreed before are all that is left
             return
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9
-        seen_mps = (self._base_from_body @ moved @ se3_inverse(self._base_from_body))[:2, 3] / duration_s
-        self._compare(seen_mps, np.mean([sample.velocity_base_mps[:2] for sample in wheel], axis=0), duration_s)
+        seen_mps = (self._base_from_body @ moved @ self._body_from_base)[:2, 3] / duration_s
+        rolled_mps = sum((sample.velocity_base_mps[:2] for sample in wheel), np.zeros(2)) / len(wheel)
+        self._compare(seen_mps, rolled_mps, duration_s)
 
     def handle_way(self, wheel: Sequence[WheelSample], way: SeenWay | None, base_from_cam: Array) -> None:
         """Add a frame of a robot whose images show the direction of its camera's way alone, which is as long as the wheels say.
@@ -225,9 +228,9 @@ class WheelAgreement:
         self._compare(seen_mps, rolled_mps, way_m / max(hypot(*rolled_mps), 0.01))
 
     def _compare(self, seen_mps: Array, rolled_mps: Array, duration_s: float) -> None:
-        seen, rolled = float(np.linalg.norm(seen_mps)), float(np.linalg.norm(rolled_mps))
+        seen, rolled = length(seen_mps), length(rolled_mps)
         step_m = min(max(seen, min(rolled, 1.0)), 10.0) * duration_s
-        if np.linalg.norm(rolled_mps - seen_mps) > max(_OFF_MPS, _OFF_SHARE * min(seen, rolled)):
+        if length(rolled_mps - seen_mps) > max(_OFF_MPS, _OFF_SHARE * min(seen, rolled)):
             self._against_m += step_m * (_REST_SHARE if rolled < 0.01 else 1.0)
             self._products += complex(*rolled_mps) * complex(*seen_mps).conjugate()
             self._seen_squares += seen**2
@@ -262,11 +265,12 @@ class ExchangedViews:
     def refused(self, wheels: WheelAgreement, accelerometer: AccelerometerCheck) -> dict[Flag, str]:
         """Return the flag of images that all other sensors contradict, with its text; empty without evidence."""
         for exchange, turn_rad in {**self._turns_rad, "": phase(wheels.ratio)}.items():
+            if abs(turn_rad) <= _SAME_WAY_RAD:
+                continue
             seen_from_true = self._base_from_body.T @ so3_exp(np.array([0.0, 0.0, -turn_rad])) @ self._base_from_body
             by = {"wheels": wheels.favours(turn_rad), "accelerometer": accelerometer.favours(seen_from_true)}
             against = [sensor for sensor, favours in by.items() if favours]
-            is_clear = abs(turn_rad) > _SAME_WAY_RAD and False not in by.values()
-            if is_clear and len(against) > (0 if exchange else 1):
+            if False not in by.values() and len(against) > (0 if exchange else 1):
                 words = f"they move turned by {abs(np.degrees(turn_rad)):.0f} degrees against {' and '.join(against)}"
                 mounted = "the cameras" if len(against) > 1 else f"the cameras or the {against[0]}"
                 cause = f"{exchange}{mounted} are mounted otherwise than calibrated"

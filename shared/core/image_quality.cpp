@@ -2,6 +2,7 @@
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
+#include <string>
 
 namespace fleetmap {
 namespace {
@@ -14,10 +15,10 @@ size_t checked(int every) {
 // Every n-th pixel of every n-th row; their sum, the sum of their squares, and the number of those at least as bright as the limit.
 auto thin(const Image& image, int every, int bright) {
   const size_t step = checked(every), height = (image.shape(0) + step - 1) / step, width = (image.shape(1) + step - 1) / step;
-  std::vector<uint8_t> thinned(height * width);
+  std::string thinned(height * width, 0);
   int64_t total = 0, squares = 0, brighter = 0;
   unlocked([&] {
-    uint8_t* to = thinned.data();
+    uint8_t* to = reinterpret_cast<uint8_t*>(thinned.data());
     const GreyImage from = image;
     for (ptrdiff_t y = 0; y < from.height; y += every)
       for (ptrdiff_t x = 0; x < from.width; x += every) {
@@ -27,7 +28,7 @@ auto thin(const Image& image, int every, int bright) {
         brighter += value >= bright;
       }
   });
-  return std::tuple(as_numpy<uint8_t, 2>(std::move(thinned), {height, width}), total, squares, brighter);
+  return std::tuple(nb::bytes(thinned.data(), thinned.size()), total, squares, brighter);
 }
 
 // Number, sum and sum of squares of the steps from pixel to pixel along every n-th row.

@@ -182,14 +182,14 @@ int8_t TrackConstraints::add(const std::vector<PlacedCamera>& cameras, const Sig
   by_clone_.resize(dof, size);
   by_clone_turned_.resize(size, dof);
   by_state_.resize(dof, size + 2);
-  own_.resize(dof, 3);
+  own_.resize(3, dof);
   left_.resize(dof);
   for (size_t row = 0; row < dof; ++row) {
     const double* const from = rows_.values[row + 3];
     std::copy(from + 3, from + 3 + size, by_clone_[row]);
     std::copy(from + 3, from + 3 + size + 2, by_state_[row]);
     for (size_t a = 0; a < size; ++a) by_clone_turned_[a][row] = from[3 + a];
-    for (int a = 0; a < 3; ++a) own_[row][a] = from[rows_.own_column() + a] * own_sigmas[a];
+    for (int a = 0; a < 3; ++a) own_[a][row] = from[rows_.own_column() + a] * own_sigmas[a];
     left_[row] = from[rows_.residual_column()];
     for (size_t a = 0; a < size; ++a) left_[row] += from[3 + a] * moved[6 * track[a / 6].clone + a % 6];
   }
@@ -212,27 +212,27 @@ int8_t TrackConstraints::add(const std::vector<PlacedCamera>& cameras, const Sig
   const double limit = chi_square_limit(dof, model.gate_quantile);
   if (!(squared() <= limit)) return -1;
   for (int k = 0; k < 3; ++k) {  // of a track's own errors, only the share that passes the gate
-    for (size_t row = 0; row < dof; ++row) whitened_[row] = own_[row][k];
+    std::copy_n(own_[k], dof, whitened_.begin());
     forward_substitute(innovation_[0], whitened_.data(), dof, dof);
     const double share = std::sqrt(share_that_passes(limit, squared()));
-    for (size_t row = 0; row < dof; ++row) own_[row][k] *= share;
+    for (size_t row = 0; row < dof; ++row) own_[k][row] *= share;
   }
 
   // H^T residual, H^T H, and the covariance that the former has.
   multiply(by_clone_turned_, by_state_, gained_);
-  multiply(by_clone_turned_, own_, carried_);
+  multiply(own_, by_clone_, carried_);
   for (size_t a = 0; a < size; ++a) {
     const size_t to = 6 * track[a / 6].clone + a % 6;
     double &sum = equations.vector[to], *const information = equations.information[to], *const scatter = equations.scatter[to];
     for (size_t row = 0; row < dof; ++row) sum += by_clone_[row][a] * left_[row];
     for (int pair = 0; pair < 2; ++pair) information[pair] += gained_[a][size + pair];
-    const double* const own = carried_[a];
-    for (size_t b = 0; b < size; ++b) {
-      const size_t at = 6 * track[b / 6].clone + b % 6;
-      information[2 + at] += gained_[a][b];
-      double total = model.noise_variance * gained_[a][b];
-      for (int k = 0; k < 3; ++k) total += own[k] * carried_[b][k];
-      scatter[at] += total;
+    const double *const along = carried_[0], *const across = carried_[1], *const disparity = carried_[2];
+    for (size_t k = 0; k < count; ++k) {
+      double* const __restrict informed = information + 2 + 6 * track[k].clone, * const __restrict scattered = scatter + 6 * track[k].clone;
+      for (size_t b = 6 * k, to = 0; to < 6; ++b, ++to) {
+        informed[to] += gained_[a][b];
+        scattered[to] += model.noise_variance * gained_[a][b] + along[a] * along[b] + across[a] * across[b] + disparity[a] * disparity[b];
+      }
     }
   }
   return 1;

@@ -230,7 +230,7 @@ def block_log_odds(
     size in metres, shift as a share of it. model: least landmarks, shares taken, different, odd; threshold.
     """
 
-def thin(image: _Grey, every: int, bright: int) -> tuple[_Grey, int, int, int]:
+def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
     """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""
 
 def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:

@@ -87,32 +87,31 @@ class CalibrationMonitor:
             self.watch.handle_unmatched(replace(query, fix=fixes[0], is_confirmed=False))
 
 
-def with_calibration(
-    estimate: Estimate, state: CalibrationState, rig: Mounting, last_fix_ns: int | None, *, was_localized: bool
-) -> Estimate:
-    """Return the estimate with the state of the calibration: if wrong, not TRACKING and with a larger covariance; the covariance
+def with_calibration(estimate: Estimate, rig: Mounting, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
+    """Return the estimate by the state of its calibration: if wrong, not TRACKING and with a larger covariance; the covariance
     also grows if an error beyond the limit is not excluded.
 
     last_fix_ns: of a confirmed pose, None for a reversed pair. With a wrong calibration, a pose without a recent fix is dropped,
     since the odometry is as wrong as the cameras.
     """
-    if not state.is_wrong:
-        return replace(estimate, calibration=state, cov_rot_trans=_widened(estimate, state, rig))
+    if not estimate.calibration.is_wrong:
+        return _widened(estimate, rig)
     status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
     is_result = estimate.cause in {Cause.NONE, Cause.UNMATCHED, Cause.ODOMETRY}
     cause = Cause.CALIBRATION if is_result else estimate.cause
-    estimate = replace(estimate, status=status, cause=cause, calibration=state)
+    estimate = replace(estimate, status=status, cause=cause)
     if last_fix_ns is not None and (estimate.odometry.stamp_ns - last_fix_ns) * 1e-9 <= _HELD_S:
-        return replace(estimate, cov_rot_trans=_widened(estimate, state, rig))
+        return _widened(estimate, rig)
     status = Status.LOST if was_localized else Status.INITIALISING
     return replace(estimate, status=status, map_from_body=None, cov_rot_trans=None)
 
 
-def _widened(estimate: Estimate, state: CalibrationState, rig: Mounting) -> Array | None:
-    covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
+def _widened(estimate: Estimate, rig: Mounting) -> Estimate:
+    covariance, map_from_body, state = estimate.cov_rot_trans, estimate.map_from_body, estimate.calibration
     if covariance is None or map_from_body is None or state.cov_bias_cam is None:
-        return covariance
-    return covariance + state.cov_bias(map_from_body @ se3_inverse(rig.cam_from_body), map_from_body)
+        return estimate
+    added = state.cov_bias(map_from_body @ se3_inverse(rig.cam_from_body), map_from_body)
+    return replace(estimate, cov_rot_trans=covariance + added)
 
 
 _MIN_MATCHES = 40

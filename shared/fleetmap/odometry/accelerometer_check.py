@@ -5,11 +5,9 @@ the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0
 of the specific force, rotated by the images' rotations, less gravity and the accelerometer's bias.
 """
 
-from itertools import pairwise
-
 import numpy as np
 
-from fleetmap.geometry import Array, so3_exps, so3_log
+from fleetmap.geometry import Array, length, so3_exps, so3_log
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
@@ -24,6 +22,9 @@ _NAMED_SQUARES = 12.0  # worse than the best fit by less than this: candidates a
 _REACH_SIGMAS = 4.0
 _GRAVITY_OFF_MPS2 = 2.0  # biases and errors of the images cause less
 _NO_GRAVITY_MPS2 = 4.0  # gravity that motion seems to show if there is none
+_AXES = np.array([[*each.ravel(), -1.0] for each in SIGNED_AXES])
+_GIVEN, _REVERSED = (int((_AXES[:, [0, 4, 8]].sum(axis=1) == trace).argmax()) for trace in (3.0, -3.0))
+_KNOWN = np.r_[:9, 15]  # of the normal equations
 _UPRIGHT = 0.7  # cosine of the angle between the base's up and the accelerometer's: ramps are far within
 
 
@@ -36,7 +37,8 @@ class AccelerometerCheck:
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body = base_from_body
         self.fault = ""
-        self._run: list[tuple[int, Array, Array]] = []  # stamps, places, rotations, in the axes of the run's first body
+        # Stamps, places, rotations, in the axes of the run's first body; and turns since the frame before.
+        self._run: list[tuple[int, Array, Array, Array]] = []
         # Normal equations of body_from_sensor (9), bias (3), up in the run's axes times gravity (3), and a change of velocity
         self._normal = np.zeros((16, 16))
         self._windows = 0.0
@@ -62,14 +64,14 @@ class AccelerometerCheck:
             return
         if earlier_from_body is None or not self._run or stamp_ns - self._run[-1][0] > _LONGEST_NS:
             # Evidence on axes and bias stays; the up direction in the axes of this frame is unknown.
-            self._run = [(stamp_ns, np.zeros(3), np.eye(3))]
+            self._run = [(stamp_ns, np.zeros(3), np.eye(3), np.zeros(3))]
             up, others = self._normal[12:15], np.linalg.pinv(self._normal[12:15, 12:15], hermitian=True)
             self._normal = self._normal - up.T @ others @ up
             self._normal[12:15], self._normal[:, 12:15] = 0.0, 0.0
             return
-        _, place, rotation = self._run[-1]
+        _, place, rotation, _ = self._run[-1]
         moved = place + rotation @ earlier_from_body[:3, 3], rotation @ earlier_from_body[:3, :3]
-        self._run.append((stamp_ns, *moved))
+        self._run.append((stamp_ns, *moved, so3_log(earlier_from_body[:3, :3])))
         stamps_ns = [each[0] for each in self._run]
         middle = next((k for k, stamp in enumerate(stamps_ns) if stamp - stamps_ns[0] >= _HALF_NS), None)
         if middle is None or stamp_ns - stamps_ns[middle] < _HALF_NS:
@@ -79,7 +81,7 @@ class AccelerometerCheck:
         self._judge(imu, on_wheels)
 
     def _add(self, middle: int, imu: ImuSamples) -> None:
-        (t0, p0, _), (t1, p1, _), (t2, p2, _) = self._run[0], self._run[middle], self._run[-1]
+        (t0, p0, *_), (t1, p1, *_), (t2, p2, *_) = self._run[0], self._run[middle], self._run[-1]
         samples = imu.between(t0, t2)
         if len(samples) < 8 or np.diff(samples.stamps_ns, prepend=t0, append=t2).max() > _HALF_NS // 4:
             return
@@ -89,11 +91,10 @@ class AccelerometerCheck:
         at_ns = np.array([each[0] for each in self._run])
         number = np.clip(np.searchsorted(at_ns, stamps, "right") - 1, 0, len(at_ns) - 2)
         shares = (stamps - at_ns[number]) / (at_ns[number + 1] - at_ns[number])
-        turns = np.array([so3_log(a[2].T @ b[2]) for a, b in pairwise(self._run)])
-        begun = np.array([each[2] for each in self._run])
-        weighted = weights[:, None, None] * (begun[number] @ so3_exps(shares[:, None] * turns[number]))
+        begun, turns = (np.array([each[k] for each in self._run]) for k in (2, 3))
+        weighted = weights[:, None, None] * (begun[number] @ so3_exps(shares[:, None] * turns[number + 1]))
         rows = np.zeros((3, 16))
-        rows[:, :9] = np.einsum("iab,ic->abc", weighted, samples.accel_mps2).reshape(3, 9)
+        rows[:, :9] = (weighted.reshape(-1, 9).T @ samples.accel_mps2).reshape(3, 9)
         rows[:, 9:12] = -weighted.sum(axis=0)
         rows[:, 12:15] = -0.5e-9 * (t2 - t0) * np.eye(3)
         rows[:, 15] = 1e9 * ((p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0))
@@ -105,20 +106,16 @@ class AccelerometerCheck:
             return
         normal = self._normal.copy()
         normal[range(9, 12), range(9, 12)] += _BIAS_SIGMA_MPS2**-2
-        known = np.append(range(9), 15)
         normal[range(12, 15), range(12, 15)] += 1e-3  # unknown where images were interrupted
-        solved = np.linalg.solve(normal[9:15, 9:15], normal[9:15][:, known])
-        left = normal[np.ix_(known, known)] - normal[9:15][:, known].T @ solved
-        axes = np.array([[*each.ravel(), -1.0] for each in SIGNED_AXES])
-        squares = np.einsum("ka,ab,kb->k", axes, left, axes)
-        ups = -(axes @ solved.T)[:, 3:]
-        given, whole = (
-            next(k for k, each in enumerate(SIGNED_AXES) if (each == a).all()) for a in (np.eye(3), -np.eye(3))
-        )
-        size = float(np.linalg.norm(ups[given]))
+        crossed = normal[9:15][:, _KNOWN]
+        solved = np.linalg.solve(normal[9:15, 9:15], crossed)
+        left = normal[_KNOWN][:, _KNOWN] - crossed.T @ solved
+        squares = (_AXES @ left * _AXES).sum(axis=1)
+        ups = -(_AXES @ solved.T)[:, 3:]
+        size = length(ups[_GIVEN])
         best = float(squares.min())
         variance = max(1.0, best / max(3.0 * self._windows - 6.0, 1.0))
-        self._judged = left, float(squares[given]), best, variance
+        self._judged = left, float(squares[_GIVEN]), best, variance
         sigma_mps2 = float(np.sqrt(variance * np.trace(np.linalg.inv(normal[9:15, 9:15])[3:, 3:])))
         if abs(size - GRAVITY_MPS2) > _GRAVITY_OFF_MPS2 + _REACH_SIGMAS * sigma_mps2:
             if self._windows >= _SIZE_WINDOWS:
@@ -127,13 +124,13 @@ class AccelerometerCheck:
         ups_base = ups @ (self._base_from_body[:3, :3] @ self._run[0][2].T).T / max(size, 1e-9)
         is_up = ups_base[:, 2] > _UPRIGHT
         is_possible = squares < best + _NAMED_SQUARES * variance
-        is_contradicted = squares[given] > max(best + _SURE_SQUARES * variance, _SURE_RATIO * best)
+        is_contradicted = squares[_GIVEN] > max(best + _SURE_SQUARES * variance, _SURE_RATIO * best)
         # Upside down: once it shows whether all axes are reversed, or one.
-        is_told = not is_possible[whole] or self._windows > _MANY_WINDOWS
-        is_reversed = on_wheels and ups_base[given, 2] < -_UPRIGHT and is_told
+        is_told = not is_possible[_REVERSED] or self._windows > _MANY_WINDOWS
+        is_reversed = on_wheels and ups_base[_GIVEN, 2] < -_UPRIGHT and is_told
         if not is_contradicted and not is_reversed:
             return
-        if abs(ups_base[given, 2]) > _UPRIGHT and (is_possible & is_up).any():  # a rig that stands as its base does
+        if abs(ups_base[_GIVEN, 2]) > _UPRIGHT and (is_possible & is_up).any():  # a rig that stands as its base does
             is_possible &= is_up
         # All axes reversed is a single fault, of a driver that reports gravity; it precedes other faults that fit equally well.
         possible = [each for k, each in enumerate(SIGNED_AXES) if is_possible[k]]

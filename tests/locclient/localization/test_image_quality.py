@@ -81,7 +81,7 @@ def test_sums_are_those_of_numpy() -> None:
     seen = np.random.default_rng(7).integers(0, 256, (43, 77)).astype(np.uint8)
     small, total, squares, brights = core.thin(seen, 8, 250)
     thinned = seen[::8, ::8].astype(np.int64)
-    np.testing.assert_array_equal(small, thinned)
+    assert small == seen[::8, ::8].tobytes()
     assert (total, squares, brights) == (thinned.sum(), (thinned**2).sum(), (thinned >= 250).sum())
     steps = np.diff(seen[::8].astype(np.int64), axis=1)
     assert core.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())

@@ -41,7 +41,7 @@ class SlidingWindow:
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
         self.contradicts_images = False
-        self._judged = deque[NDArray[np.int8]](maxlen=_JUDGED_UPDATES)  # accepted and refused tracks
+        self._judged = deque[tuple[int, int]](maxlen=_JUDGED_UPDATES)  # numbers of accepted and refused tracks
         self._refused_frames = 0  # in a row in which the filter refused tracks and accepted none
         settings = rig.settings.filter
         true_error_cov = settings.real_start_share**2 * start.covariance
@@ -63,12 +63,12 @@ class SlidingWindow:
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """As `Odometry.motion_since`."""
+        if frame_index in self.filter.clone_ids:  # of nearly all frames
+            return self.filter.motion_since(frame_index)
         kept, frame_from_kept = self._kept(frame_index)
         if kept not in self.filter.clone_ids:
             return None
         kept_from_now, covariance = self.filter.motion_since(kept)
-        if kept == frame_index:  # of nearly all frames
-            return kept_from_now, covariance
         carry = se3_adjoint(frame_from_kept)
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
@@ -127,16 +127,16 @@ class SlidingWindow:
         seen, scale = self.matched_body(tracked), self.rig.settings.filter.descriptor_sigma_scale
         effort = (iterations,) if seen is None else (4, seen[1], scale)
         used = self.filter.update(*chosen, *effort)
-        if (used == 1).any():
+        self._judged.append((int(np.count_nonzero(used == 1)), int(np.count_nonzero(used == -1))))
+        if self._judged[-1][0]:
             self._refused_frames = 0
-        elif self._refused_frames or (used == -1).any():
+        elif self._refused_frames or self._judged[-1][1]:
             self._refused_frames += 1
-        self._judged.append(used[used != 0])
-        judged = np.concatenate(self._judged)
-        is_clear = len(self._judged) == _JUDGED_UPDATES and len(judged) >= _JUDGED_TRACKS
-        takes_few = is_clear and (judged == 1).mean() < _LEAST_TAKEN
+        taken, refused = (sum(counts) for counts in zip(*self._judged, strict=True))
+        is_clear = len(self._judged) == _JUDGED_UPDATES and taken + refused >= _JUDGED_TRACKS
+        takes_few = is_clear and taken < _LEAST_TAKEN * (taken + refused)
         # Or each of few tracks was due once.
-        self.contradicts_images = bool(takes_few or self._refused_frames >= chunk_frames)
+        self.contradicts_images = takes_few or self._refused_frames >= chunk_frames
         self._prune()
         return used
 

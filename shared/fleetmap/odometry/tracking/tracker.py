@@ -122,17 +122,18 @@ class Tracker:
         self._memory.clear()
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
-        guess, before, points_cam = np.eye(4) if guess is None else guess, self._points.ids, None
+        guess, before, points_cam = np.eye(4) if guess is None else guess, None, None
         if self._points_in_camera is not None:
-            points_cam = self._points_in_camera(before + self._first_id)
+            before = self._ids()
+            points_cam = self._points_in_camera(before)
             points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
         solved, share = self._step(frame, guess, is_predicted, points_cam)
         motion, information = solved or (None, None)
-        if motion is None and points_cam is not None:
+        ids, pixels = self._ids(), self._points.pixels
+        if motion is None and before is not None:
             # Without parallax none of the tracked points can be triangulated: they suffice to continue.
-            motion = guess if np.isin(self._points.ids, before).sum() >= self._settings.min_inliers else None
-        pixels = self._points.pixels
-        return Tracked(self._ids(), pixels, (), motion, share, by_descriptors=False, information=information)
+            motion = guess if np.isin(ids, before).sum() >= self._settings.min_inliers else None
+        return Tracked(ids, pixels, (), motion, share, by_descriptors=False, information=information)
 
     @property
     def next_id(self) -> int:

@@ -138,7 +138,8 @@ def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance
 
 
 def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | None) -> Estimate:
-    return with_calibration(before, watch.state, RIG, last_fix_ns, was_localized=True)
+    judged = replace(before, calibration=watch.state)
+    return with_calibration(judged, RIG, last_fix_ns, was_localized=True)
 
 
 def first_look(parameters: Array) -> FinishedQuery:
