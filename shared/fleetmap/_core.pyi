@@ -230,6 +230,9 @@ def block_log_odds(
     size in metres, shift as a share of it. model: least landmarks, shares taken, different, odd; threshold.
     """
 
+def png_rows(filtered: _Grey, pixel_bytes: int) -> _Grey:
+    """Bytes (H, N) of a PNG file's rows, from filtered ones (H, 1 + N); ValueError for a filter that there is not."""
+
 def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
     """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""
 

@@ -3,7 +3,6 @@
 import os
 import re
 import struct
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +16,7 @@ from fleetmap.geometry import AnyArray
 from fleetmap.recordings.decoder_messages import with_messages
 from fleetmap.recordings.files import what_instead
 from fleetmap.recordings.limits import MAX_PIXELS
+from fleetmap.recordings.png import PNG_START, is_damaged_png, plain_png_pixels
 from fleetmap.sensors.samples import CameraFrame, Image
 
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})(?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})[\s#]")
@@ -35,7 +35,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     try:
         if data.startswith(b"\xff\xd8"):
             return _jpeg_size(data)
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        if data.startswith(PNG_START):
             width, height = struct.unpack_from(">II", data, 16)
             return (width, height) if data[12:16] == b"IHDR" else None
         if data.startswith((b"II*\0", b"MM\0*")):
@@ -133,7 +133,7 @@ _DAMAGED = re.compile("Corrupt JPEG data|Premature end|libpng error|IDAT")
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Images with sensor noise have hardly any repetitions: run-length coding is faster and, by measurement, smaller.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PNG_END = b"IEND\xaeB`\x82"
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,30 +280,13 @@ def depth_image(depth_m: NDArray[np.float32]) -> StoredImage:
 
 def file_kind(data: bytes) -> str:
     """`jpeg`, `png` or `other`, by the first bytes."""
-    return "jpeg" if data.startswith(_JPEG_START) else "png" if data.startswith(_PNG_START) else "other"
+    return "jpeg" if data.startswith(_JPEG_START) else "png" if data.startswith(PNG_START) else "other"
 
 
 def is_cut(head: bytes, tail: bytes) -> bool:
     """True if a JPEG or PNG file, by its first and last bytes, is truncated. OpenCV silently fills the missing part with grey."""
     end = {"jpeg": _JPEG_END, "png": _PNG_END}.get(file_kind(head))
     return end is not None and end not in tail.rstrip(b"\0")[-64:]
-
-
-def is_damaged_png(data: bytes) -> bool:
-    """True if a checksum in a PNG file fails; False for other files.
-
-    A JPEG file has no checksums.
-    """
-    at = len(_PNG_START) if file_kind(data) == "png" else len(data)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        end = at + 8 + length
-        if end + 4 > len(data) or zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            return True
-        if data[at + 4 : at + 8] == b"IEND":
-            return False
-        at = end + 4
-    return at < len(data)
 
 
 def store_frame(frame: CameraFrame) -> StoredFrame:
@@ -383,6 +366,9 @@ def _inverse_depth_scale(stored: StoredImage) -> tuple[float, float]:
 
 
 def _decode_file(stored: StoredImage) -> AnyArray:
+    plain = None if is_cut(stored.data, stored.data) else plain_png_pixels(stored.data)
+    if plain is not None:
+        return plain
     _check_file(stored)
     try:
         pixels, said = with_messages(lambda: cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED))

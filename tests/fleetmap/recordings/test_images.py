@@ -1,5 +1,6 @@
 """Images that are damaged inside cost their frame, and no sentence of a decoder reaches stderr."""
 
+import io
 import struct
 import threading
 import zlib
@@ -9,11 +10,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import images, open_recording
 from fleetmap.recordings.images import INVERSE_DEPTH, RAW_ENCODINGS, StoredImage, decode_depth, decode_grey
+from fleetmap.recordings.png import plain_png_pixels
 from fleetmap.recordings.ros2 import messages as ros_messages
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
 from support.recordings.recording_samples import HEIGHT, WIDTH, make_sample, png_of, write_euroc
@@ -53,6 +56,38 @@ def test_damage_is_an_error_in_our_words(data: bytes, capfd: pytest.CaptureFixtu
     with pytest.raises(RecordingError, match=r"camera: .*(damaged|cut off|no bytes)"):
         decode_grey(StoredImage("file", data, "camera"))
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 33), (33, 7, 3)])
+@pytest.mark.parametrize("filter_of_rows", ["NONE", "SUB", "UP", "AVG", "PAETH"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_plain_pngs_have_the_pixels_that_opencv_reads(shape: tuple[int, ...], filter_of_rows: str, bits: int) -> None:
+    pixels = np.random.default_rng(1).integers(0, 1 << bits, shape, f"uint{bits}")
+    data = bytes(
+        cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_FILTER, getattr(cv2, f"IMWRITE_PNG_FILTER_{filter_of_rows}")])[1]
+    )
+    found = plain_png_pixels(data)
+    if (bits, len(shape)) == (16, 3):
+        assert found is None
+        return
+    assert found is not None
+    assert found.dtype == pixels.dtype
+    np.testing.assert_array_equal(found, pixels)
+
+
+def test_pngs_of_other_kinds_and_any_flipped_byte_are_left_to_opencv() -> None:
+    small = io.BytesIO()
+    grey = PIL.Image.fromarray(NOISE[:9, :9])
+    grey.save(small, "png")
+    for options in ({"transparency": 7}, {"bits": 4}):
+        other = io.BytesIO()
+        (grey.convert("P") if "bits" in options else grey).save(other, "png", **options)
+        assert plain_png_pixels(other.getvalue()) is None
+    data = small.getvalue()
+    assert plain_png_pixels(data) is not None
+    assert plain_png_pixels(png_of(zlib.compress(ROWS + b"\0"), 80, 60)) is None
+    for at in range(len(data)):
+        assert plain_png_pixels(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]) is None, at
 
 
 def test_packed_depth_too(capfd: pytest.CaptureFixture[str]) -> None:

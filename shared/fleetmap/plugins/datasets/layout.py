@@ -25,10 +25,10 @@ from fleetmap.recordings.images import (
     file_kind,
     image_size,
     is_cut,
-    is_damaged_png,
 )
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
 from fleetmap.recordings.ordering import LAST_NS, ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
+from fleetmap.recordings.png import is_damaged_png
 from fleetmap.recordings.tum import parse_stamp_ns
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, Trajectory
