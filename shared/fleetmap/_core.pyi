@@ -233,6 +233,13 @@ def block_log_odds(
 def png_rows(filtered: _Grey, pixel_bytes: int) -> _Grey:
     """Bytes (H, N) of a PNG file's rows, from filtered ones (H, 1 + N); ValueError for a filter that there is not."""
 
+class Remap:
+    """Resamples images by the fixed-point tables of `cv2.convertMaps` as `cv2.remap` does, to the bit; beyond the image all is black."""
+
+    def __init__(self, pixels: NDArray[np.int16], shares: NDArray[np.uint16], height: int, width: int) -> None:
+        """pixels (H, W, 2), shares (H, W): of the result; height, width: of the images."""
+    def __call__(self, image: _Grey) -> _Grey: ...
+
 def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
     """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""
 

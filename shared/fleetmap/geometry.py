@@ -83,14 +83,10 @@ def se3(rotation: Array, translation_m: Array) -> Array:
 
 def se3_inverse(target_from_source: Array) -> Array:
     """source_from_target; also for stacks (..., 4, 4)."""
-    if target_from_source.ndim == 2:
-        rotation, translation_m = target_from_source[:3, :3].T, target_from_source[:3, 3:]
-        return se3(rotation, -(rotation @ translation_m)[:, 0])
-    rotation = np.swapaxes(target_from_source[..., :3, :3], -1, -2)
-    source_from_target = np.zeros_like(target_from_source)
-    source_from_target[..., :3, :3] = rotation
-    source_from_target[..., :3, 3] = -(rotation @ target_from_source[..., :3, 3:])[..., 0]
-    source_from_target[..., 3, 3] = 1.0
+    source_from_target = target_from_source.swapaxes(-1, -2).copy()
+    rotation = target_from_source[..., :3, :3].swapaxes(-1, -2)
+    source_from_target[..., :3, 3:] = -(rotation @ target_from_source[..., :3, 3:])
+    source_from_target[..., 3, :3] = 0.0
     return source_from_target
 
 

@@ -1,5 +1,6 @@
 """Information of one fix on the mounting of the cameras, by gravity, driving direction and the ground. Pure."""
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -53,8 +54,11 @@ class WheelTravel:
 
     def at(self, stamp_ns: int) -> Array:
         """Return (3,) x, y in metres and yaw in radians since the first sample; NaN before the oldest kept sample and after the newest."""
-        elapsed_ns = np.array(self._stamps_ns) - stamp_ns
-        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in np.array(self._x_y_yaw).T])
+        after = bisect_left(self._stamps_ns, stamp_ns)
+        around = [max(after - 1, 0), min(after, len(self._stamps_ns) - 1)]
+        elapsed_ns = [self._stamps_ns[k] - stamp_ns for k in around]
+        places = np.array([self._x_y_yaw[k] for k in around])
+        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in places.T])
 
 
 def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import (
@@ -216,7 +217,7 @@ class Rectifier:
             depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
             disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
             if self._maps[0] is not None:
-                nearest = cv2.remap(disparity, *self._maps[0], cv2.INTER_NEAREST, borderValue=float("nan"))
+                nearest = cv2.remap(disparity, *self._maps[0][1], cv2.INTER_NEAREST, borderValue=float("nan"))
                 disparity = np.asarray(nearest, np.float32)
         others = (self._other(*each) for each in zip(frame.others, self.others, strict=False))
         return RectifiedFrame(frame.stamp_ns, left, right, disparity, tuple(others))
@@ -239,7 +240,7 @@ class Rectifier:
                 "pass the matching one with --calibration FILE"
             )
         tables = self._maps[index]
-        return image if tables is None else np.asarray(cv2.remap(image, *tables, cv2.INTER_LINEAR), np.uint8)
+        return image if tables is None else tables[0](np.ascontiguousarray(image))
 
 
 def _rectifying_rotation(
@@ -275,8 +276,8 @@ def _remap_tables(
     distortion: tuple[float, ...],
     cam_from_rect: tuple[float, ...],
     mask: tuple[Polygon, ...],
-) -> tuple[tuple[NDArray[np.int16], NDArray[np.uint16]] | None, NDArray[np.bool_] | None]:
-    """Fixed-point look-up tables for cv2.remap, or None if the image is already rectified (as KITTI's are); and the rectified mask."""
+) -> tuple[tuple[core.Remap, tuple[NDArray[np.int16], NDArray[np.uint16]]] | None, NDArray[np.bool_] | None]:
+    """Fixed-point look-up tables, also for cv2.remap, or None if the image is already rectified (as KITTI's); and the rectified mask."""
     v, u = np.indices((rectified.height_px, rectified.width_px), np.float64)
     x, y = (u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px
     rays = np.stack([x, y, np.ones_like(u)], -1).reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
@@ -294,7 +295,8 @@ def _remap_tables(
         return None, hidden
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
     first, second = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
-    return (np.asarray(first, np.int16), np.asarray(second, np.uint16)), hidden
+    tables = np.asarray(first, np.int16), np.asarray(second, np.uint16)
+    return (core.Remap(*tables, size_px[1], size_px[0]), tables), hidden
 
 
 def _clearance_px(hidden: NDArray[np.bool_] | None) -> Image | None:

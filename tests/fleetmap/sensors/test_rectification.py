@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -68,6 +70,19 @@ def test_dots_appear_where_the_rectified_pair_says(model: str) -> None:
     assert np.abs(errors).max() < 0.07
     assert np.abs(np.mean(errors, axis=0)).max() < 0.01
     assert abs(np.mean(np.array(errors)[:, 1] - np.array(errors)[:, 3])) < 0.01
+
+
+@pytest.mark.parametrize("size_px", [(480, 752), (37, 53), (5, 6)])
+@pytest.mark.parametrize("bend_px", [0.5, 8.0, 60.0], ids=lambda px: f"bent by {px} px")
+def test_pictures_are_resampled_as_opencv_does(size_px: tuple[int, int], bend_px: float) -> None:
+    rng = np.random.default_rng(1)
+    v, u = np.indices(size_px, np.float32)
+    at = u + bend_px * np.sin(v / 50) + rng.normal(0.0, 0.05, size_px), 0.9 * v + bend_px * np.cos(u / 70)
+    tables = cv2.convertMaps(*(each.astype(np.float32) for each in at), cv2.CV_16SC2)
+    height, width = size_px[0] - 1, size_px[1] + 3
+    picture = rng.integers(0, 256, (height, width)).astype(np.uint8)
+    made = core.Remap(*tables, height, width)(picture)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(made, cv2.remap(picture, *tables, cv2.INTER_LINEAR))
 
 
 def test_points_come_back_from_pixel_and_disparity() -> None:

@@ -74,6 +74,9 @@ class SlidingWindow:
 
     def body_since(self, frame_index: int) -> Array | None:
         """The transform of `motion_since` alone."""
+        ids = self.filter.clone_ids
+        if frame_index in ids:
+            return self.filter.motion_between(frame_index, ids[-1])
         found = self.motion_since(frame_index)
         return None if found is None else found[0]
 
