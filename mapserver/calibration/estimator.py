@@ -227,6 +227,5 @@ class Problem:
 
     def _log_determinant(self, theta: Array, state: MotionState, rows: ImageRows, shares: Array) -> float:
         """Return it for the information of all unknowns, with the kinds weighted by shares (6,)."""
-        factor = np.sqrt(shares[[0, 0, 1, 2]])[:, None]
-        scaled = rows._replace(by_point=rows.by_point * factor, by_calibration=rows.by_calibration * factor)
+        scaled = rows._replace(shares=shares[[0, 0, 1, 2]])
         return solver_of(self.bundle(theta, state, shares[3:], scaled), SETTINGS).log_determinant()

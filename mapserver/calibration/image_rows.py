@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, so3_exp
+from fleetmap import core
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.calibration.motion_rows import CalibrationData, MotionState
@@ -28,9 +29,7 @@ from mapserver.calibration.parameters import (
 from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
-_MIN_DEPTH_M = 0.05
-_STEP_PX = 0.1  # of the numerical derivative of rectified by raw pixels
-_BEHIND_SIGMAS = 1000.0  # residual of a landmark behind the camera: beyond every cutoff, with zero slope
+_STEP_PX = 0.1  # of the numerical derivative of raw by rectified pixels
 # Columns that move what the left lens measures
 _LEFT_LENS = {
     INDEX[P.FOCAL],
@@ -47,6 +46,9 @@ _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.0
 _PLACE = [INDEX[p] for p in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z)]
 _TURN = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
 _SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
+_COLUMNS = np.array(
+    [_TURN.start, _SHIFT.start, INDEX[P.TIME_OFFSET], INDEX[P.FOCAL_RATIO], *_PLACE]
+)  # as the core takes them
 
 
 class Measured(NamedTuple):
@@ -96,37 +98,46 @@ class Observations:
     def measured(self, theta: Array, pair: tuple[StereoCamera, StereoCamera] | None = None) -> Measured:
         """Return what is seen in the image rectified by theta, at the scale of `pair`."""
         pair = pair or self.pair(theta)
-        left = self._left_by_raw(theta, pair)
-        return Measured(self._rows(theta, left, pair), self._as_given(left))
+        left, right = self._rectified(theta, pair)
+        return Measured(
+            np.column_stack([left, left - right]), self._as_given(self._raw_by_rectified(left, theta, pair))
+        )
 
-    def _rows(self, theta: Array, left: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
-        """Return (M, 4) rows from those of `_left_by_raw`."""
-        if self.axes.baseline_m == 0:
-            return np.column_stack([left[..., 0], np.zeros_like(left[..., 0])])
-        rig, (rect_from_right, _) = corrected_rig(self.calibration, self.axes, theta), right_camera(self.axes, theta)
-        right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, pair[1])
-        return np.column_stack([left[..., 0], left[..., 0] - right])
+    def _rectified(self, theta: Array, pair: tuple[StereoCamera, StereoCamera]) -> tuple[Array, Array]:
+        """Return (M, 2) pixels in the rectified images of both cameras; of a single one twice."""
+        cameras, turns = corrected_rig(self.calibration, self.axes, theta).cameras, self._rect_from_cams(theta)
+        raw = self.left_px, self.right_px
+        views = zip(cameras, raw, turns, pair, strict=False)
+        found = [_pixels(camera.ray_from_pixel(pixels) @ turn.T, view) for camera, pixels, turn, view in views]
+        return found[0], found[-1]
 
-    def _left_by_raw(self, theta: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
-        """Return (M, 2, 3) the left image's rectified pixels, and their derivatives by the raw pixel's x and y."""
-        camera = corrected_rig(self.calibration, self.axes, theta).cameras[0]
-        steps = _STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        rays = [camera.ray_from_pixel(self.left_px + step) @ self.axes.rect_from_cam[0].T for step in steps]
-        here, *beside = (_pixels(each, pair[0]) for each in rays)
-        return np.stack([here, *((each - here) / _STEP_PX for each in beside)], axis=2)
+    def _rect_from_cams(self, theta: Array) -> list[Array]:
+        right = [right_camera(self.axes, theta)[0]] if self.axes.baseline_m > 0 else []
+        return [self.axes.rect_from_cam[0], *right]
 
-    def _as_given(self, left: Array) -> Array:
-        now, given = left[..., 1:], self._given_by_raw
-        apart = now[:, 0, 0] * now[:, 1, 1] - now[:, 0, 1] * now[:, 1, 0]
-        usable = np.isfinite(apart) & (apart != 0.0) & np.isfinite(given).all(axis=(1, 2))
-        found = np.tile(np.eye(2), (len(now), 1, 1))
-        found[usable] = given[usable] @ np.linalg.inv(now[usable])
-        return found
+    def _raw(self, number: int, rectified: Array, theta: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
+        """Return raw pixels (M, 2) of a camera: the inverse of `_rectified`."""
+        camera = corrected_rig(self.calibration, self.axes, theta).cameras[number]
+        return camera.pixel_from_ray(_rays(pair[number], rectified) @ self._rect_from_cams(theta)[number])
+
+    def _raw_by_rectified(
+        self, rectified: Array, theta: Array, pair: tuple[StereoCamera, StereoCamera], number: int = 0
+    ) -> Array:
+        """Return (M, 2, 2) derivatives of raw by rectified pixels."""
+        steps = _STEP_PX * np.eye(2)
+        ends = [[self._raw(number, rectified + sign * step, theta, pair) for sign in (1, -1)] for step in steps]
+        return np.stack([(more - less) / (2.0 * _STEP_PX) for more, less in ends], axis=2)
+
+    def _as_given(self, raw_by_now: Array) -> Array:
+        """Return that of `Measured`; the identity where it is unknown."""
+        found = _product(self._given_by_raw, raw_by_now)
+        return np.ascontiguousarray(np.where(np.isfinite(found).all(axis=(1, 2), keepdims=True), found, np.eye(2)))
 
     @cached_property
     def _given_by_raw(self) -> Array:
         none = np.zeros(UNKNOWNS)
-        return self._left_by_raw(none, self.pair(none))[..., 1:]
+        pair = self.pair(none)
+        return _inverse(self._raw_by_rectified(self._rectified(none, pair)[0], none, pair))
 
     def pair(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
         """Return the left and right pinholes, each with the focal length of its lens."""
@@ -135,19 +146,31 @@ class Observations:
         return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
 
     def measured_slopes(self, theta: Array) -> Measured:
-        """Return derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
+        """Return derivatives of `measured` at a fixed scale of the pinholes; zero if absent.
+
+        A ray whose raw pixel a change of the lens would move has to move back for the pixel to stay: no lens is inverted anew. Source: the
+        theorem of implicit functions.
+        """
         pair, count = self.pair(theta), len(self.left_px)
+        places = self._rectified(theta, pair)
         slopes = Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS)))
-        left = self._left_by_raw(theta, pair)
+        by_raw = [
+            _inverse(self._raw_by_rectified(place, theta, pair, n))
+            for n, place in enumerate(places[: len(self.axes.rect_from_cam)])
+        ]
         for column, size in _LENS_STEPS.items():
-            step = size * (np.arange(UNKNOWNS) == column)
+            ends = [(theta + sign * size * (np.arange(UNKNOWNS) == column), sign * size) for sign in (1, -1)]
+            moves = []
+            for number, (place, turn) in enumerate(zip(places, by_raw, strict=False)):
+                more, less = (self._raw(number, place, end, pair) for end, _ in ends)
+                moves.append(_product(turn, (less - more)[:, :, None])[..., 0] / (2.0 * size))
+            change = np.column_stack([moves[0], moves[0] - moves[-1]])
+            slopes.rows[..., column] = np.where(np.isfinite(change), change, 0.0)
             if column in _LEFT_LENS:
-                more, less = self.measured(theta + step, pair), self.measured(theta - step, pair)
-                change = more.rows - less.rows
-                slopes.as_given[..., column] = (more.as_given - less.as_given) / (2.0 * size)
-            else:
-                change = self._rows(theta + step, left, pair) - self._rows(theta - step, left, pair)
-            slopes.rows[..., column] = np.where(np.isfinite(change), change / (2.0 * size), 0.0)
+                more, less = (
+                    self._as_given(self._raw_by_rectified(places[0] + step * moves[0], end, pair)) for end, step in ends
+                )
+                slopes.as_given[..., column] = (more - less) / (2.0 * size)
         return slopes
 
 
@@ -158,6 +181,18 @@ def _pixels(rays: Array, view: StereoCamera) -> Array:
 
 def _rays(camera: StereoCamera, pixels: Array) -> Array:
     return np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(len(pixels))])
+
+
+def _inverse(matrices: Array) -> Array:
+    """Return the inverses of (M, 2, 2), NaN or infinite where there are none."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((np.array([[d, -b], [-c, a]]) / (a * d - b * c)).transpose(2, 0, 1))
+
+
+def _product(left: Array, right: Array) -> Array:
+    """Return (M, 2, k), the products of (M, 2, 2) and (M, 2, k)."""
+    return np.asarray(left[:, :, :1] * right[:, :1] + left[:, :, 1:] * right[:, 1:])
 
 
 def image_rows(
@@ -175,59 +210,27 @@ def image_rows(
 
     scales (4,): factors on the rows' sigmas.
     """
-    pair, positions = seen.pair(theta), state.map_from_body[:, :3, 3]
+    left, right = seen.pair(theta)
     turned = seen.axes.body_from_rect @ so3_exp(theta[_TURN])
     place = seen.calibration.cameras[0].body_from_cam[:3, 3] + theta[_SHIFT]
-    rect_from_map = (turned.T @ state.map_from_body[:, :3, :3].transpose(0, 2, 1))[data.obs_keyframe]
-    # Landmarks from the bodies, in map axes, and in the left camera; place of the right one in that
-    from_body = state.points_map[data.obs_landmark] - positions[data.obs_keyframe]
-    in_left = np.einsum("mij,mj->mi", rect_from_map, from_body) - turned.T @ place
     right_m = right_camera(seen.axes, theta)[1] if seen.axes.baseline_m > 0 else np.zeros(3)
-    is_ahead, is_seen = in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
-    usable = is_ahead[:, None] & is_seen
-    # of the pixel, of the pair's difference
-    off = np.where(usable, measured.rows - _predicted(in_left, right_m, pair), 0.0).reshape(-1, 2, 2)
-    back = measured.as_given
-    errors = np.einsum("mij,mkj->mki", back, off).reshape(-1, 4)
-    factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)
-    residuals = np.where(is_ahead[:, None] | ~is_seen, errors * factor, _BEHIND_SIGMAS)
-    if fixed is None:
-        return ImageRows(residuals, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
-    by_left = _projection_slopes(in_left, pair[0])
-    by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
-    by_calibration = fixed.slopes.rows.copy()
-    if seen.axes.baseline_m > 0:
-        by_right = _projection_slopes(in_left - right_m, pair[1])
-        by_cam[:, 2:] = by_left - by_right
+    slopes = None
+    if fixed is not None:
         steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
         moved = [right_camera(seen.axes, theta + step)[1] - right_camera(seen.axes, theta - step)[1] for step in steps]
-        by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, np.stack(moved, axis=1) / 2e-6)
-    by_point = -np.einsum("mij,mjk->mik", by_cam, rect_from_map)
-    # X <- Exp(-phi) X changes by X x phi
-    by_calibration[:, :, _TURN] = -np.cross(by_cam, in_left[:, None, :])
-    by_calibration[:, :, _SHIFT] = -np.einsum("mij,mjk->mik", by_point, state.map_from_body[data.obs_keyframe, :3, :3])
-    flow = np.cross(from_body, fixed.rates_map[data.obs_keyframe]) - state.motions[data.obs_keyframe, :3]
-    by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_point, flow)
-    by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 1] - off[:, 0]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
-    by_point = (back[:, None] @ by_point.reshape(-1, 2, 2, 3)).reshape(-1, 4, 3) * factor[:, :, None]
-    by_calibration = (back[:, None] @ by_calibration.reshape(-1, 2, 2, UNKNOWNS)).reshape(-1, 4, UNKNOWNS)
-    by_calibration += np.einsum("mijc,mkj->mkic", fixed.slopes.as_given, off).reshape(-1, 4, UNKNOWNS)
-    by_calibration *= factor[:, :, None]
-    return ImageRows(residuals, by_point, by_calibration, positions)
-
-
-def _predicted(in_left: Array, right_m: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
-    left = pair[0].pixel_from_point(in_left)[:, :2]
-    if not right_m.any():
-        return np.column_stack([left, np.zeros_like(left)])
-    return np.column_stack([left, left - pair[1].pixel_from_point(in_left - right_m)[:, :2]])
-
-
-def _projection_slopes(points: Array, camera: StereoCamera) -> Array:
-    """Return (M, 2, 3) derivatives of pixels by points."""
-    z = np.maximum(points[:, 2], _MIN_DEPTH_M)
-    slopes = np.zeros((len(points), 2, 3))
-    slopes[:, 0, 0] = slopes[:, 1, 1] = camera.focal_px / z
-    slopes[:, 0, 2] = -camera.focal_px * points[:, 0] / z**2
-    slopes[:, 1, 2] = -camera.focal_px * points[:, 1] / z**2
-    return slopes
+        zoom = float(1.0 + theta[INDEX[P.FOCAL_RATIO]])
+        slopes = *fixed.slopes, fixed.rates_map, state.motions, np.stack(moved, axis=1) / 2e-6, _COLUMNS, zoom
+    residuals, by_point, by_calibration = core.image_rows(
+        np.array([left.focal_px, right.focal_px, left.cx_px, left.cy_px]),
+        se3_inverse(se3(turned, place)),
+        right_m,
+        state.map_from_body,
+        state.points_map,
+        data.obs_keyframe.astype(np.int32),
+        data.obs_landmark.astype(np.int32),
+        *measured,
+        seen.row_sigmas * scales,
+        slopes,
+    )
+    by_calibration = by_calibration.reshape(-1, 4, UNKNOWNS)  # also without any
+    return ImageRows(residuals, by_point, by_calibration, state.map_from_body[:, :3, 3])

@@ -282,12 +282,13 @@ bool BundleSolver::linearise(const Seen& seen, Vec3 q, Symmetric& info, Vec3& sl
 // The same of an observation that is given as rows, and its E_n; H_cc and b_c grow by its share.
 bool BundleSolver::linearise(const ImageRows& rows, size_t observation, Symmetric& info, Vec3& slope) {
   const size_t first = kRows * order_[observation], width = columns();
-  const double weight = robust_weight(std::sqrt(squared(rows.residuals + first, kRows)), huber_, cutoff_);
-  if (weight == 0.0) return false;
+  const double robust = robust_weight(std::sqrt(squared(rows.residuals + first, kRows)), huber_, cutoff_);
+  if (robust == 0.0) return false;
   coupling_.assign(3 * width, 0.0);
   for (size_t row = first; row < first + kRows; ++row) {
     const Vec3 point = vec3(rows.by_point + 3 * row);
-    const double *calibration = rows.by_calibration + row * width, pull = weight * rows.residuals[row];
+    const double *calibration = rows.by_calibration + row * width, weight = robust * rows.shares[row - first];
+    const double pull = weight * rows.residuals[row];
     slope = slope + pull * point;
     for (int a = 0, c = 0; a < 3; ++a) {
       for (int b = a; b < 3; ++b, ++c) info[size_t(c)] += weight * (point[a] * point[b]);

@@ -43,6 +43,7 @@ struct BundleState {
 // Whitened rows of M observations in the problem's order; their derivatives only on request.
 struct ImageRows {
   const double *residuals, *by_point, *by_calibration;  // (M, 4), (M, 4, 3), (M, 4, C)
+  const double* shares;                                 // (4,) factors on the weights of an observation's rows
   const Vec3* positions;                                // (K,) of the bodies when the images were taken
   std::shared_ptr<const void> owner;                    // of these numbers
 };

@@ -10,6 +10,7 @@ namespace {
 constexpr int kIterations = 12;
 constexpr double kStep = 1e-6;
 constexpr double kNearest = 1e-9;
+constexpr double kLargestAngle = 3.1;  // of equidistant lenses: straight back has no pixel
 
 // Radial-tangential distortion k1 k2 p1 p2 k3 k4 k5 k6. Sources: Brown 1966; OpenCV's order and its rational model.
 struct RadialTangential {
@@ -40,7 +41,7 @@ std::pair<double, double> distorted(const RadialTangential& lens, double x, doub
 bool is_seen(const RadialTangential& lens, double reach, Vec3 point, double* image) {
   const double x = point[0] / point[2], y = point[1] / point[2];
   std::tie(image[0], image[1]) = distorted(lens, x, y);
-  return x * x + y * y < reach;
+  return point[2] > kNearest && x * x + y * y < reach;
 }
 
 bool is_seen(const Equidistant& lens, double, Vec3 point, double* image) {
@@ -51,7 +52,7 @@ bool is_seen(const Equidistant& lens, double, Vec3 point, double* image) {
   const double slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)));
   const double scale = planar > 1e-12 ? radius / planar : 1.0 / point[2];
   image[0] = scale * point[0], image[1] = scale * point[1];
-  return slope > 0;
+  return slope > 0 && angle <= kLargestAngle && std::isfinite(scale);
 }
 
 bool is_seen(const Sphere& lens, double reach, Vec3 point, double* image) {
@@ -117,31 +118,54 @@ void fill_nearest(const float* depth, const double* rays, size_t count, const SE
   }
 }
 
+// Calls use with the lens that these coefficients say.
+template <typename Use>
+void with_lens(const Reals& lens, const Use& use) {
+  const size_t size = lens.shape(0);
+  if (size == 8)
+    use(RadialTangential(lens.data()));
+  else if (size == 12)
+    use(Sphere{RadialTangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
+  else if (size == 4)
+    use(Equidistant{lens(0), lens(1), lens(2), lens(3)});
+  else
+    throw nb::value_error("lens: 8 coefficients, radial-tangential, 4, equidistant, or 12, a sphere's");
+}
+
+auto pixels_of_rays(const Points& rays, const Array<double, 4>& intrinsics, const Reals& lens, double reach) {
+  const size_t count = rays.shape(0);
+  auto pixels = zeros<double>(2 * count);
+  with_lens(lens, [&](const auto& coefficients) {
+    unlocked([&] {
+      for (size_t n = 0; n < count; ++n) {
+        double image[2];
+        const bool is_there = is_seen(coefficients, reach, rays.rows()[n], image);
+        for (size_t axis = 0; axis < 2; ++axis)
+          pixels[2 * n + axis] = is_there ? intrinsics(axis) * image[axis] + intrinsics(2 + axis) : std::nan("");
+      }
+    });
+  });
+  return as_numpy<double, 2>(std::move(pixels), {count, 2});
+}
+
 auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const SE3& colour_from_depth, const Array<double, 4>& intrinsics,
                     const Reals& lens, double reach, int width, int height) {
   constexpr int64_t kMostPixels = 1 << 26;
-  const size_t count = depth.size(), size = lens.shape(0);
+  const size_t count = depth.size();
   check_rows(count, "rays: one for each pixel of depth", rays);
-  if (size != 8 && size != 4 && size != 12)
-    throw nb::value_error("lens: 8 coefficients, radial-tangential, 4, equidistant, or 12, a sphere's");
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
   const LensCamera camera{intrinsics(0), intrinsics(1), intrinsics(2), intrinsics(3), reach, width, height};
   auto colour = zeros<float>(size_t(width) * size_t(height));
-  const auto fill = [&](const auto& coefficients) {
+  with_lens(lens, [&](const auto& coefficients) {
     unlocked([&] { fill_nearest(depth.data(), rays.data(), count, colour_from_depth, camera, coefficients, colour.data()); });
-  };
-  if (size == 8)
-    fill(RadialTangential(lens.data()));
-  else if (size == 12)
-    fill(Sphere{RadialTangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
-  else
-    fill(Equidistant{lens(0), lens(1), lens(2), lens(3)});
+  });
   return as_numpy<float, 2>(std::move(colour), {size_t(height), size_t(width)});
 }
 
 }  // namespace
 
 void bind_camera(nb::module_& module) {
+  module.def("pixels_of_rays", &pixels_of_rays, "rays"_a, "intrinsics"_a, "lens"_a, "reach"_a);
   module.def("undistort", &undistort, "lens"_a, "goals_x"_a, "goals_y"_a);
   module.def("register_depth", &register_depth, "depth"_a, "rays"_a, "colour_from_depth"_a, "intrinsics"_a, "lens"_a, "reach"_a, "width"_a,
              "height"_a);

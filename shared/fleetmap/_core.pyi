@@ -246,6 +246,9 @@ def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
 def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
     """Number, sum and sum of squares of the steps from pixel to pixel along every n-th row."""
 
+def pixels_of_rays(rays: _Reals, intrinsics: _Reals, lens: _Reals, reach: float) -> _Reals:
+    """(N, 2) pixels of rays (N, 3), NaN without one; the camera as in `register_depth`."""
+
 def undistort(lens: _Reals, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
     """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 maps to the goals; not checked."""
 
@@ -583,6 +586,27 @@ def inertial_residual(
     derivatives by the biases, and their linearisation point.
     """
 
+def image_rows(
+    lens: _Reals,
+    cam_from_body: _Reals,
+    right_m: _Reals,
+    map_from_body: _Reals,
+    points_map: _Reals,
+    obs_keyframe: _Numbers,
+    obs_landmark: _Numbers,
+    measured: _Reals,
+    as_given: _Reals,
+    sigmas: _Reals,
+    slopes: tuple[_Reals, _Reals, _Reals, _Reals, _Reals, _Indices, float] | None,
+) -> tuple[_Reals, _Reals, _Reals]:
+    """Whitened rows of M observations: residuals (M, 4), and with slopes the derivatives by point (M, 4, 3) and calibration (M, 4, C).
+
+    lens (4,): focal lengths of the left and the right pinhole, cx, cy. right_m (3,): the right camera in axes of the left one, or zero.
+    measured (M, 4): left pixel, disparity and row difference; as_given (M, 2, 2) turns their errors; sigmas (M, 4), infinite without an
+    observation. slopes: (M, 4, C) of `measured`, (M, 2, 2, C) of as_given; angular rates (K, 3), motions (K, 9); right_m's (3, 3) by the
+    baseline and its direction; columns (7,) of turn, shift, time offset, focal ratio and those three; 1 plus the focal ratio.
+    """
+
 class BundleSolver:
     """Bundle adjustment of K keyframes, N landmarks, M observations.
 
@@ -594,7 +618,8 @@ class BundleSolver:
     1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: further unknowns, theta
     (C,) with weight (C,) 1 / sigma^2 about zero; ways (R, 3), the effect of theta[scale] on the translations of the relative poses; and a
     function of the whitened rows of the images instead of the lens, called with map_from_body, motions, points_map, theta, and True if
-    derivatives are wanted: residuals (M, 4), derivatives by point (M, 4, 3) and theta (M, 4, C), positions (K, 3) of the exposed bodies.
+    derivatives are wanted: residuals (M, 4), derivatives by point (M, 4, 3) and theta (M, 4, C), positions (K, 3) of the exposed bodies,
+    and factors (4,) on the weights of an observation's rows.
     """
 
     def __init__(

@@ -46,13 +46,14 @@ class InertialTerms:
 class ImageRows(NamedTuple):
     """Whitened rows of M observations: residuals (M, 4), derivatives by point (M, 4, 3) and calibration (M, 4, C).
 
-    positions_map (K, 3): of the keyframes' bodies at exposure.
+    positions_map (K, 3): of the keyframes' bodies at exposure. shares (4,): factors on the weights of an observation's rows.
     """
 
     residuals: Array
     by_point: Array
     by_calibration: Array
     positions_map: Array
+    shares: Array = np.ones(4)
 
 
 class SelfCalibration(NamedTuple):

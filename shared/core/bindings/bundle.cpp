@@ -23,7 +23,7 @@ std::vector<double> numbers(const double* from, size_t count) { return {from, fr
 using Calibration = std::tuple<Reals, Reals, Points, size_t, nb::callable>;
 template <int64_t... kShape>
 using Answer = nb::ndarray<const double, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;  // converted where that is needed
-using Rows = std::tuple<Answer<-1, 4>, Answer<-1, 4, 3>, Answer<-1, 4, -1>, Answer<-1, 3>>;
+using Rows = std::tuple<Answer<-1, 4>, Answer<-1, 4, 3>, Answer<-1, 4, -1>, Answer<-1, 3>, Answer<4>>;
 
 auto poses_of(const BundleState& state) {
   auto matrices = zeros<double>(16 * state.map_from_body.size());
@@ -56,14 +56,14 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
   const nb::gil_scoped_acquire held;
   Rows rows;
   const nb::object answer = said(poses_of(state), motions_of(state), points_of(state), state.calibration, derivatives);
-  check(nb::try_cast(answer, rows), "rows: residuals, derivatives by point and calibration, and positions");
-  const auto& [residuals, by_point, by_calibration, positions] = rows;
+  check(nb::try_cast(answer, rows), "rows: residuals, derivatives by point and calibration, positions, and shares");
+  const auto& [residuals, by_point, by_calibration, positions, shares] = rows;
   const size_t derived = derivatives ? observations : 0;
   check_rows(observations, "rows: residuals of each observation", residuals);
   check(by_point.shape(0) >= derived && by_calibration.shape(0) >= derived && by_calibration.shape(2) == state.calibration.size(),
         "rows: derivatives of each observation, by all of the calibration");
   check_rows(state.map_from_body.size(), "rows: a position for each keyframe", positions);
-  return {residuals.data(), by_point.data(), by_calibration.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
+  return {residuals.data(), by_point.data(), by_calibration.data(), shares.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
 }
 
 void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cams, const Poses& map_from_body, const Table& motions,

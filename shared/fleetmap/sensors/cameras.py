@@ -26,7 +26,8 @@ class CameraModel:
 
     def pixel_from_ray(self, intrinsics_px: Array, distortion: Array, rays_cam: Array) -> Array:
         """(N, 2) pixels of rays (N, 3), NaN outside the lens's field of view. intrinsics_px: (4,) fx fy cx cy."""
-        raise NotImplementedError
+        rays = np.ascontiguousarray(rays_cam, np.float64)
+        return core.pixels_of_rays(rays, np.asarray(intrinsics_px, np.float64), *self.core_lens(distortion))
 
     def ray_from_pixel(self, intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
         """(N, 3) unit rays of pixels (N, 2), NaN where no ray maps to the pixel."""
@@ -56,17 +57,6 @@ class RadialTangential(CameraModel):
     """
 
     distortion_counts = (0, 4, 5, 8)
-
-    def pixel_from_ray(self, intrinsics_px: Array, distortion: Array, rays_cam: Array) -> Array:
-        fx, fy, cx, cy = intrinsics_px
-        lens = _coefficients(distortion)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = rays_cam[:, 0] / rays_cam[:, 2], rays_cam[:, 1] / rays_cam[:, 2]
-            seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(lens))
-            distorted_x, distorted_y = _distort(lens, x, y)
-        pixels = np.stack([fx * distorted_x + cx, fy * distorted_y + cy], axis=1)
-        pixels[~seen] = np.nan
-        return pixels
 
     def ray_from_pixel(self, intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
         """Newton's method with a numeric Jacobian; NaN if it does not converge to the pixel."""
@@ -119,17 +109,6 @@ class Equidistant(CameraModel):
 
     distortion_counts = (4,)
 
-    def pixel_from_ray(self, intrinsics_px: Array, distortion: Array, rays_cam: Array) -> Array:
-        fx, fy, cx, cy = intrinsics_px
-        planar = np.hypot(rays_cam[:, 0], rays_cam[:, 1])
-        theta = np.arctan2(planar, rays_cam[:, 2])
-        radius, slope = _radius_and_slope(distortion, theta)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.where(planar > 1e-12, radius / planar, 1.0 / rays_cam[:, 2])
-        pixels = np.stack([fx * scale * rays_cam[:, 0] + cx, fy * scale * rays_cam[:, 1] + cy], axis=1)
-        pixels[(slope <= 0) | (theta > 3.1) | ~np.isfinite(scale)] = np.nan
-        return pixels
-
     def ray_from_pixel(self, intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
         """Newton's method on the radius; NaN if no angle gives it."""
         fx, fy, cx, cy = intrinsics_px
@@ -177,18 +156,6 @@ class Sphere(CameraModel):
         """shape: xi, beta, a and b of the parameters."""
         self.kalibr, self.ranges, self._shape = kalibr, ranges, shape
         self.distortion_counts = (PLANE + len(ranges),)
-
-    def pixel_from_ray(self, intrinsics_px: Array, distortion: Array, rays_cam: Array) -> Array:
-        xi, beta, a, b = self._shape(*distortion[PLANE:])
-        x, y, z = rays_cam.T
-        squared = x * x + y * y
-        w = z + xi * np.sqrt(squared + z * z)
-        d2 = np.sqrt(beta * squared + w * w)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            plane = np.stack([x, y, a * d2 + b * w], axis=1) / (a * d2 + b * w)[:, None]
-        pixels = _PINHOLE.pixel_from_ray(intrinsics_px, distortion[:PLANE], plane)
-        pixels[~(w * max(a, b) > -d2 * min(a, b))] = np.nan
-        return pixels
 
     def ray_from_pixel(self, intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
         xi, beta, a, b = self._shape(*distortion[PLANE:])
