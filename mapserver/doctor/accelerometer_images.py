@@ -1,16 +1,15 @@
 """The accelerometer against the images: signs and order of its axes, and the metric scale of the images.
 
-Positions of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the
-integral of the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, for any velocity. The same integral of
-the specific force, rotated by the images, is that change in true metres, plus gravity, plus the accelerometer's bias.
+Of the changes of velocity that robots see too (`fleetmap.odometry.accelerometer_check`), and with the metres as a further unknown.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
 
 from fleetmap.geometry import Array, so3_exp
+from fleetmap.odometry.accelerometer_check import Posed, change_of_velocity
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.camera_motion import CameraTurns
@@ -59,22 +58,23 @@ def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: floa
     windows = _windows(turns, imu, imu_minus_cam_s)
     if len(windows) < _MIN_WINDOWS:
         return []
-    changes, forces, biases, runs, spans_s = (np.array(column) for column in zip(*windows, strict=True))
+    rows, runs = (np.array(column) for column in zip(*windows, strict=True))
+    forces = rows[:, :, :9]
     # metres, bias, gravity in the axes at the start of each run of frames
     design = np.zeros((len(windows), 3, 7 + 3 * int(runs.max())))
-    design[:, :, 0], design[:, :, 1:4] = changes, biases
-    for axis in range(3):
-        design[np.arange(len(windows)), axis, 4 + 3 * runs + axis] = spans_s
+    design[:, :, 0], design[:, :, 1:4] = rows[:, :, 15], -rows[:, :, 9:12]
+    for number, run in enumerate(runs):
+        design[number, :, 4 + 3 * run : 7 + 3 * run] = -rows[number, :, 12:15]
     held = np.zeros((3, design.shape[2]))
     held[:, 1:4] = np.eye(3) * _NOISE_MPS / _BIAS_SIGMA_MPS2
     fits: list[AxesFit] = []
     kept = np.ones(len(windows), bool)
     for _ in range(2):  # the second time without outliers of the best
-        rows = np.concatenate([design[kept].reshape(-1, design.shape[2]), held])
-        inverse, freedom = np.linalg.pinv(rows), max(len(rows) - design.shape[2], 1)
+        whole = np.concatenate([design[kept].reshape(-1, design.shape[2]), held])
+        inverse, freedom = np.linalg.pinv(whole), max(len(whole) - design.shape[2], 1)
         fits, least = [], np.inf
         for axes in SIGNED_AXES:
-            seen = np.einsum("krab,ab->kr", forces, axes)
+            seen = forces @ axes.ravel()
             unknowns = inverse @ np.append(seen[kept].ravel(), np.zeros(3))
             off = seen - design @ unknowns
             squares = float((off[kept] ** 2).sum())
@@ -113,53 +113,25 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
     return Finding(NAME, Verdict.FAIL, None, limit, words)
 
 
-class _Window(NamedTuple):
-    """One change of velocity: by the images (3,); by the specific force, (3, 3, 3) to be summed with body_from_accel over the last two;
-    the effect of a bias on that (3, 3); run: number of the run of frames; span_s: factor of gravity in it."""
-
-    change: Array
-    force: Array
-    bias: Array
-    run: int
-    span_s: float
-
-
-def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[_Window]:
-    """Return the windows of all runs of consecutive frames, in the axes of the body at the start of their run."""
+def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[tuple[Array, int]]:
+    """Return rows (3, 16) of the changes of velocity in all runs of consecutive frames, each with the number of its run."""
     known = np.isfinite(turns.ways_m).all(axis=1)
     if len(imu) < 10 or known.sum() < 2:
         return []
     turns = turns.only(np.flatnonzero(known))
-    origin_ns = int(turns.starts_ns[0])
-    starts_s, ends_s = (turns.starts_ns - origin_ns) * 1e-9, (turns.ends_ns - origin_ns) * 1e-9
-    times_s = (imu.stamps_ns - origin_ns) * 1e-9 - imu_minus_cam_s
-    steps = max(1, round(_HALF_WINDOW_S / float(np.median(ends_s - starts_s))))
-    broken = np.flatnonzero(turns.starts_ns[1:] != turns.ends_ns[:-1]) + 1
-    windows: list[_Window] = []
-    run = 0
-    for first, end in zip([0, *broken], [*broken, len(starts_s)], strict=True):
-        if end - first < 2 * steps:
-            continue
-        places, rotations = [np.zeros(3)], [np.eye(3)]
+    starts_ns, ends_ns = (stamps + round(imu_minus_cam_s * 1e9) for stamps in (turns.starts_ns, turns.ends_ns))
+    spans_s = (ends_ns - starts_ns) * 1e-9
+    steps = max(1, round(_HALF_WINDOW_S / float(np.median(spans_s))))
+    broken = np.flatnonzero(starts_ns[1:] != ends_ns[:-1]) + 1
+    windows: list[tuple[Array, int]] = []
+    long = [ends for ends in pairwise([0, *broken, len(starts_ns)]) if ends[1] - ends[0] >= 2 * steps]
+    for number, (first, end) in enumerate(long):
+        run: list[Posed] = [(int(starts_ns[first]), np.zeros(3), np.eye(3), np.zeros(3))]
         for k in range(first, end):
-            places.append(places[-1] + rotations[-1] @ turns.ways_m[k])
-            rotations.append(rotations[-1] @ so3_exp(turns.rates_body_radps[k] * (ends_s[k] - starts_s[k])))
-        at_s = np.append(starts_s[first:end], ends_s[end - 1])
-        for k in range(0, end - first - 2 * steps + 1, steps):
-            t0, t1, t2 = at_s[[k, k + steps, k + 2 * steps]]
-            inside = np.flatnonzero((times_s > t0) & (times_s < t2))
-            if len(inside) < 4 or np.diff(times_s[inside]).max() > 0.25 * _HALF_WINDOW_S:
-                continue
-            p0, p1, p2 = places[k], places[k + steps], places[k + 2 * steps]
-            t = times_s[inside]
-            weights = np.minimum((t - t0) / (t1 - t0), (t2 - t) / (t2 - t1))
-            weights *= 0.5 * (t2 - t0) / weights.sum()
-            number = np.clip(np.searchsorted(at_s, t) - 1, 0, end - first - 1)
-            vectors = turns.rates_body_radps[first + number] * (t - at_s[number])[:, None]
-            turned = np.array([rotations[n] @ so3_exp(vector) for n, vector in zip(number, vectors, strict=True)])
-            weighted = weights[:, None, None] * turned
-            force = np.einsum("iab,ic->abc", weighted, imu.accel_mps2[inside])
-            change = (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0)
-            windows.append(_Window(change, force, weighted.sum(axis=0), run, 0.5 * (t2 - t0)))
-        run += 1
+            _, place, rotation, _ = run[-1]
+            turn = turns.rates_body_radps[k] * spans_s[k]
+            run.append((int(ends_ns[k]), place + rotation @ turns.ways_m[k], rotation @ so3_exp(turn), turn))
+        for k in range(0, len(run) - 2 * steps, steps):
+            rows = change_of_velocity(run[k : k + 2 * steps + 1], steps, imu)
+            windows += [] if rows is None else [(rows, number)]
     return windows

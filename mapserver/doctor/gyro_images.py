@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
+from fleetmap.odometry.gyro_clock import turned_between
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words, in_axes
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.camera_motion import CameraTurns
@@ -150,13 +151,9 @@ def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tup
 def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shift_s: float) -> Array:
     """Return (K, 3) mean gyro rates over the intervals, shifted by `shift_s` on the IMU's clock."""
     origin_ns = int(imu.stamps_ns[0])
-    times_s = (imu.stamps_ns - origin_ns) * 1e-9
-    steps = np.diff(times_s)[:, None] * 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1])
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    start_s = (turns.starts_ns - origin_ns) * 1e-9 + shift_s
-    end_s = (turns.ends_ns - origin_ns) * 1e-9 + shift_s
-    angles = [np.interp(end_s, times_s, column) - np.interp(start_s, times_s, column) for column in turned.T]
-    return np.stack(angles, axis=1) / (end_s - start_s)[:, None]
+    between_s = (np.column_stack([turns.starts_ns, turns.ends_ns]) - origin_ns) * 1e-9 + shift_s
+    turned = turned_between((imu.stamps_ns - origin_ns) * 1e-9, imu.gyro_radps, between_s)
+    return np.asarray(turned / np.diff(between_s))
 
 
 def correlation(first: Array, second: Array) -> float:

@@ -27,7 +27,7 @@ _Depths = tuple[_Floats, int, float, _Reals, _Reals, float, float]
 # Pixels (M, 2), conics (M, 3), reaches_px (M, 2), peaks (M,), greys (M,).
 _Gaussians = tuple[_Reals, _Reals, _Reals, _Reals, _Reals]
 _Counts = NDArray[np.uint16]
-_Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
+_Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals, _Reals]]
 
 def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) -> _Indices:
     """(P, 2) pairs that are each other's nearest."""

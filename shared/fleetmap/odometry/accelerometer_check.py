@@ -5,6 +5,8 @@ the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0
 of the specific force, rotated by the images' rotations, less gravity and the accelerometer's bias.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fleetmap.geometry import Array, length, so3_exps, so3_log
@@ -13,6 +15,7 @@ from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
 
 _HALF_NS, _LONGEST_NS = 200_000_000, 350_000_000  # half a window, and the longest between two frames
+_GAP_NS = 50_000_000  # between two samples, at most
 _CHANGE_SIGMA_MPS, _BIAS_SIGMA_MPS2 = 0.05, 0.3
 _KEPT = 0.97  # of earlier evidence, with each window: turns accumulate errors of the images
 _MIN_WINDOWS, _SIZE_WINDOWS, _MANY_WINDOWS = 4, 10, 20
@@ -28,6 +31,36 @@ _KNOWN = np.r_[:9, 15]  # of the normal equations
 _UPRIGHT = 0.7  # cosine of the angle between the base's up and the accelerometer's: ramps are far within
 
 
+Posed = tuple[int, Array, Array, Array]
+"""Stamp on the IMU's clock, place and rotation of a body, in the axes of the first one of its run, and its turn since the one before."""
+
+
+def change_of_velocity(run: Sequence[Posed], middle: int, imu: ImuSamples) -> Array | None:
+    """Return rows (3, 16) of the body's change of velocity about run[middle]; None with gaps in the samples.
+
+    Their product with body_from_sensor (9), the bias (3), up in the run's axes times gravity (3), and minus the metres in one of the places
+    is zero.
+    """
+    (t0, p0, *_), (t1, p1, *_), (t2, p2, *_) = run[0], run[middle], run[-1]
+    samples = imu.between(t0, t2)
+    if len(samples) < 8 or np.diff(samples.stamps_ns, prepend=t0, append=t2).max() > _GAP_NS:
+        return None
+    stamps = samples.stamps_ns
+    weights = np.minimum((stamps - t0) / (t1 - t0), (t2 - stamps) / (t2 - t1))
+    weights *= 0.5e-9 * (t2 - t0) / weights.sum()
+    at_ns = np.array([each[0] for each in run])
+    number = np.clip(np.searchsorted(at_ns, stamps, "right") - 1, 0, len(at_ns) - 2)
+    shares = (stamps - at_ns[number]) / (at_ns[number + 1] - at_ns[number])
+    begun, turns = (np.array([each[k] for each in run]) for k in (2, 3))
+    weighted = weights[:, None, None] * (begun[number] @ so3_exps(shares[:, None] * turns[number + 1]))
+    rows = np.zeros((3, 16))
+    rows[:, :9] = (weighted.reshape(-1, 9).T @ samples.accel_mps2).reshape(3, 9)
+    rows[:, 9:12] = -weighted.sum(axis=0)
+    rows[:, 12:15] = -0.5e-9 * (t2 - t0) * np.eye(3)
+    rows[:, 15] = 1e9 * ((p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0))
+    return rows
+
+
 class AccelerometerCheck:
     """Follows images and samples frame by frame.
 
@@ -37,10 +70,8 @@ class AccelerometerCheck:
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body = base_from_body
         self.fault = ""
-        # Stamps, places, rotations, in the axes of the run's first body; and turns since the frame before.
-        self._run: list[tuple[int, Array, Array, Array]] = []
-        # Normal equations of body_from_sensor (9), bias (3), up in the run's axes times gravity (3), and a change of velocity
-        self._normal = np.zeros((16, 16))
+        self._run: list[Posed] = []
+        self._normal = np.zeros((16, 16))  # equations of `change_of_velocity`
         self._windows = 0.0
         # The squares' matrix for axes (9) and -1, those of the given axes and of the best fit, and the variance
         self._judged: tuple[Array, float, float, float] | None = None
@@ -76,30 +107,12 @@ class AccelerometerCheck:
         middle = next((k for k, stamp in enumerate(stamps_ns) if stamp - stamps_ns[0] >= _HALF_NS), None)
         if middle is None or stamp_ns - stamps_ns[middle] < _HALF_NS:
             return
-        self._add(middle, imu)
+        rows = change_of_velocity(self._run, middle, imu)
+        if rows is not None:
+            self._normal = _KEPT * self._normal + rows.T @ rows / _CHANGE_SIGMA_MPS**2
+            self._windows = _KEPT * self._windows + 1.0
         del self._run[:middle]
         self._judge(imu, on_wheels)
-
-    def _add(self, middle: int, imu: ImuSamples) -> None:
-        (t0, p0, *_), (t1, p1, *_), (t2, p2, *_) = self._run[0], self._run[middle], self._run[-1]
-        samples = imu.between(t0, t2)
-        if len(samples) < 8 or np.diff(samples.stamps_ns, prepend=t0, append=t2).max() > _HALF_NS // 4:
-            return
-        stamps = samples.stamps_ns
-        weights = np.minimum((stamps - t0) / (t1 - t0), (t2 - stamps) / (t2 - t1))
-        weights *= 0.5e-9 * (t2 - t0) / weights.sum()
-        at_ns = np.array([each[0] for each in self._run])
-        number = np.clip(np.searchsorted(at_ns, stamps, "right") - 1, 0, len(at_ns) - 2)
-        shares = (stamps - at_ns[number]) / (at_ns[number + 1] - at_ns[number])
-        begun, turns = (np.array([each[k] for each in self._run]) for k in (2, 3))
-        weighted = weights[:, None, None] * (begun[number] @ so3_exps(shares[:, None] * turns[number + 1]))
-        rows = np.zeros((3, 16))
-        rows[:, :9] = (weighted.reshape(-1, 9).T @ samples.accel_mps2).reshape(3, 9)
-        rows[:, 9:12] = -weighted.sum(axis=0)
-        rows[:, 12:15] = -0.5e-9 * (t2 - t0) * np.eye(3)
-        rows[:, 15] = 1e9 * ((p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0))
-        self._normal = _KEPT * self._normal + rows.T @ rows / _CHANGE_SIGMA_MPS**2
-        self._windows = _KEPT * self._windows + 1.0
 
     def _judge(self, imu: ImuSamples, on_wheels: bool) -> None:
         if self._windows < _MIN_WINDOWS:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.core import longest_gap_ns
-from fleetmap.geometry import Array, so3_log
+from fleetmap.geometry import AnyArray, Array, so3_log
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.sensors.samples import ImuSamples
 
@@ -30,6 +30,13 @@ _PRIOR = np.zeros((7, 7))
 _PRIOR[:3, :3] = _PRIOR[:3, 4:] = _PRIOR[4:, :3] = (_TURN_SIGMA_RAD / _MATRIX_SIGMA) ** 2 * np.eye(3)
 _PRIOR[4:, 4:] = _PRIOR[:3, :3]
 _PRIOR[3, 3] = (_TURN_SIGMA_RAD / _BIAS_SIGMA_RADPS) ** 2
+
+
+def turned_between(times_s: AnyArray, rates_radps: Array, between_s: AnyArray) -> Array:
+    """Return (..., 3) rotations by a gyro's samples, rates (n, 3) at times (n,), between pairs of times (..., 2)."""
+    steps = np.diff(times_s)[:, None] * 0.5 * (rates_radps[1:] + rates_radps[:-1])
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return np.stack([np.diff(np.interp(between_s, times_s, column))[..., 0] for column in turned.T], axis=-1)
 
 
 class GyroClock:
@@ -70,13 +77,10 @@ class GyroClock:
             return
         stamps, rates = imu.stamps_ns[first - 1 : end + 1], imu.gyro_radps[first - 1 : end + 1]
         times_s = (stamps - begin_ns) * 1e-9
-        turned = np.zeros((len(stamps), 3))
-        np.cumsum(np.diff(times_s)[:, None] * 0.5 * (rates[1:] + rates[:-1]), axis=0, out=turned[1:])
         between_s = np.array([(start_ns - begin_ns, end_ns - begin_ns) for start_ns, end_ns, _ in batch]) * 1e-9
         at_s = _SHIFTS_S[:, None, None] + between_s  # (shifts, batch, 2)
         rows = np.empty((*at_s.shape[:2], 7))
-        for axis in range(3):
-            rows[:, :, axis] = np.diff(np.interp(at_s, times_s, turned[:, axis]), axis=2)[:, :, 0]
+        rows[:, :, :3] = turned_between(times_s, rates, at_s)
         rows[:, :, 3] = np.diff(between_s, axis=1)[:, 0]
         rows[:, :, 4:] = [turn for *_, turn in batch]
         self._grams = _KEPT * self._grams + rows.transpose(0, 2, 1) @ rows
