@@ -54,6 +54,41 @@ int64_t longest_gap_ns(const Indices& stamps_ns, int64_t start_ns, int64_t end_n
   return std::max(longest_ns, difference(after < stop ? *after : end_ns, before_ns));
 }
 
+// Rows (3, 16) of change_of_velocity for a run of frames, of which `middle` is the one where the weight is largest: by the
+// accelerometer's axes (9), its bias (3) and gravity (3), and the change of velocity. Frames have rotations and places, in the axes of
+// the first, and turns since the one before.
+std::vector<std::array<double, 16>> velocity_change_rows(const Indices& stamps_ns, const Points& accel_mps2, const Indices& frames_ns,
+                                                         const Array<double, -1, 3, 3>& rotations, const Points& turns_rad,
+                                                         const Points& places_m, size_t middle) {
+  const size_t frames = frames_ns.shape(0);
+  check_rows(stamps_ns.shape(0), "accel_mps2: a row for each of stamps_ns", accel_mps2);
+  check_rows(frames, "rotations, turns_rad, places_m: one for each of frames_ns", rotations, turns_rad, places_m);
+  if (middle == 0 || middle + 1 >= frames) throw nb::value_error("middle: between the first and the last frame");
+  const auto seconds = [](int64_t later_ns, int64_t earlier_ns) { return 1e-9 * double(difference(later_ns, earlier_ns)); };
+  const int64_t begin = frames_ns(0), top = frames_ns(middle), end = frames_ns(frames - 1);
+  const double rise = seconds(top, begin), fall = seconds(end, top), half = 0.5 * seconds(end, begin);
+  const auto weight = [&](int64_t stamp) { return std::min(seconds(stamp, begin) / rise, seconds(end, stamp) / fall); };
+  double total = 0.0;
+  for (const int64_t stamp : stamps_ns) total += weight(stamp);
+  std::vector<std::array<double, 16>> rows(3);
+  for (size_t n = 0, k = 0; n < stamps_ns.size(); ++n) {
+    const int64_t stamp = stamps_ns(n);
+    while (k + 2 < frames && frames_ns(k + 1) <= stamp) ++k;
+    const double share = seconds(stamp, frames_ns(k)) / seconds(frames_ns(k + 1), frames_ns(k));
+    const Mat3 turned = (weight(stamp) * half / total) * (mat3(&rotations(k, 0, 0)) * so3_exp(share * turns_rad.rows()[k + 1]));
+    for (size_t a = 0; a < 3; ++a)
+      for (size_t b = 0; b < 3; ++b) {
+        for (size_t c = 0; c < 3; ++c) rows[a][3 * b + c] += turned[a][b] * accel_mps2(n, c);
+        rows[a][9 + b] -= turned[a][b];
+      }
+  }
+  for (size_t a = 0; a < 3; ++a) {
+    rows[a][12 + a] = -half;
+    rows[a][15] = (places_m(frames - 1, a) - places_m(middle, a)) / fall - (places_m(middle, a) - places_m(0, a)) / rise;
+  }
+  return rows;
+}
+
 // Largest standard deviation of the means of a window's parts, largest mean of the rate, size of gravity and its tolerance.
 struct SteadyLimits {
   double gyro_sigma, accel_sigma, gyro_mean, gravity, gravity_error;
@@ -119,6 +154,8 @@ int64_t latest_steady(const Indices& stamps_ns, const Points& gyro_radps, const 
 void bind_imu_checks(nb::module_& module) {
   module.def("drop_spikes", &drop_spikes, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "known"_a);
   module.def("longest_gap_ns", &longest_gap_ns, "stamps_ns"_a, "start_ns"_a, "end_ns"_a);
+  module.def("velocity_change_rows", &velocity_change_rows, "stamps_ns"_a, "accel_mps2"_a, "frames_ns"_a, "rotations"_a, "turns_rad"_a,
+             "places_m"_a, "middle"_a);
   module.def("is_steady", &is_steady, "gyro_radps"_a, "accel_mps2"_a, "limits"_a);
   module.def("latest_steady", &latest_steady, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "first_ns"_a, "until_ns"_a, "window_ns"_a,
              "limits"_a);

@@ -708,6 +708,17 @@ def drop_spikes(stamps_ns: _Indices, gyro_radps: _Reals, accel_mps2: _Reals, kno
 def longest_gap_ns(stamps_ns: _Indices, start_ns: int, end_ns: int) -> int:
     """Longest time without a sample between start and end, both included."""
 
+def velocity_change_rows(
+    stamps_ns: _Indices,
+    accel_mps2: _Reals,
+    frames_ns: _Indices,
+    rotations: _Reals,
+    turns_rad: _Reals,
+    places_m: _Reals,
+    middle: int,
+) -> _Reals:
+    """Rows (3, 16) of `change_of_velocity` for a run of frames, whose weight is largest at `middle`."""
+
 def is_steady(gyro_radps: _Reals, accel_mps2: _Reals, limits: tuple[float, float, float, float, float]) -> bool:
     """True if the means of tenths of a window agree, and are those of a body at rest or at constant speed.
 
@@ -927,6 +938,8 @@ class Filter:
     @property
     def clone_ids(self) -> list[int]:
         """Oldest first."""
+
+    velocity_covariance: _Reals
 
     @property
     def covariance(self) -> _Reals:

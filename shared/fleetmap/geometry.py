@@ -5,7 +5,7 @@ A transform is a (4, 4) float64 matrix named `target_from_source`. Tangent vecto
 """
 
 from collections.abc import Iterable
-from math import sqrt
+from math import atan2, sqrt
 from typing import Any
 
 import numpy as np
@@ -179,8 +179,8 @@ def align_points(points_target: Array, points_source: Array, *, with_scale: bool
 
 
 def rotation_angle_rad(rotation: Array) -> float:
-    """Angle in [0, pi] of a rotation (3, 3)."""
-    return length(so3_log(rotation))
+    """Angle in [0, pi] of a rotation (3, 3), by its sine and cosine."""
+    return atan2(length(rotation - rotation.T) / sqrt(8.0), 0.5 * (rotation.trace() - 1.0))
 
 
 def rotation_between_vectors(source: Array, target: Array) -> Array:

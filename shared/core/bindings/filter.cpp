@@ -175,6 +175,11 @@ void bind_filter(nb::module_& module) {
       .def("body_covariance", in_turn(&Filter::body_covariance))
       .def("nav_state", in_turn(&nav_state))
       .def_prop_ro("clone_ids", in_turn(&clone_ids))
+      .def_prop_ro("velocity_covariance", in_turn(+[](SharedFilter& filter) {
+                     Mat3 block;
+                     for (size_t a = 0; a < 3; ++a) std::copy_n(filter.covariance[Filter::kVelocity + a] + Filter::kVelocity, 3, block[a]);
+                     return block;
+                   }))
       .def_prop_ro("covariance", in_turn(+[](SharedFilter& filter) { return matrix(filter.covariance); }), nb::rv_policy::automatic)
       .def_prop_ro("true_error_cov", in_turn(+[](SharedFilter& filter) { return matrix(filter.true_error_cov); }), nb::rv_policy::automatic)
       .def_prop_ro("offset_sigma_s", in_turn(+[](SharedFilter& filter) {

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.geometry import Array, length, so3_exps, so3_log
+from fleetmap import core
+from fleetmap.geometry import Array, length, so3_log
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
@@ -41,24 +42,13 @@ def change_of_velocity(run: Sequence[Posed], middle: int, imu: ImuSamples) -> Ar
     Their product with body_from_sensor (9), the bias (3), up in the run's axes times gravity (3), and minus the metres in one of the places
     is zero.
     """
-    (t0, p0, *_), (t1, p1, *_), (t2, p2, *_) = run[0], run[middle], run[-1]
-    samples = imu.between(t0, t2)
-    if len(samples) < 8 or np.diff(samples.stamps_ns, prepend=t0, append=t2).max() > _GAP_NS:
+    start_ns, end_ns = run[0][0], run[-1][0]
+    samples = imu.between(start_ns, end_ns)
+    if len(samples) < 8 or core.longest_gap_ns(samples.stamps_ns, start_ns, end_ns) > _GAP_NS:
         return None
-    stamps = samples.stamps_ns
-    weights = np.minimum((stamps - t0) / (t1 - t0), (t2 - stamps) / (t2 - t1))
-    weights *= 0.5e-9 * (t2 - t0) / weights.sum()
-    at_ns = np.array([each[0] for each in run])
-    number = np.clip(np.searchsorted(at_ns, stamps, "right") - 1, 0, len(at_ns) - 2)
-    shares = (stamps - at_ns[number]) / (at_ns[number + 1] - at_ns[number])
-    begun, turns = (np.array([each[k] for each in run]) for k in (2, 3))
-    weighted = weights[:, None, None] * (begun[number] @ so3_exps(shares[:, None] * turns[number + 1]))
-    rows = np.zeros((3, 16))
-    rows[:, :9] = (weighted.reshape(-1, 9).T @ samples.accel_mps2).reshape(3, 9)
-    rows[:, 9:12] = -weighted.sum(axis=0)
-    rows[:, 12:15] = -0.5e-9 * (t2 - t0) * np.eye(3)
-    rows[:, 15] = 1e9 * ((p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0))
-    return rows
+    frames_ns, places, rotations, turns = (np.array(each) for each in zip(*run, strict=True))
+    of_frames = frames_ns, rotations, turns, places, middle
+    return core.velocity_change_rows(samples.stamps_ns, samples.accel_mps2, *of_frames)
 
 
 class AccelerometerCheck:

@@ -522,7 +522,7 @@ class InertialMode(WindowMode):
         if wheel is not None:
             window.filter.correct_by_wheel_sample(*wheel, self._rig.base_from_body, _GATE_4)
         settings = self._rig.settings.filter
-        is_unknown = window.filter.covariance[3, 3] > 0.5 * settings.initial_velocity_sigma_mps**2
+        is_unknown = window.filter.velocity_covariance[0, 0] > 0.5 * settings.initial_velocity_sigma_mps**2
         if is_unknown and not self.is_bridged and seen is not None:
             lacking_mps = self._lacking_mps(seen)
             # Images give a start in motion to who did not rest, if they are near enough to each other.
@@ -538,7 +538,7 @@ class InertialMode(WindowMode):
         moved = (
             window.filter.odom_from_body(),
             None if self.is_bridged else window.body_since(frame_index - 1),
-            float(np.sqrt(window.filter.covariance[5, 5])),
+            float(np.sqrt(window.filter.velocity_covariance[2, 2])),
         )
         is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)
         is_by_imu = self._rig.camera.baseline_m == 0 and window.stamp_ns - self._measured_ns > _BY_IMU_NS
@@ -574,7 +574,7 @@ class InertialMode(WindowMode):
         if predicted is None:
             return 0.0
         off_m, duration_s = length(seen[:3, 3] - predicted[:3, 3]), self.window.seconds_since(frame_index)
-        sigma_mps = float(np.sqrt(np.trace(self.window.filter.covariance[3:6, 3:6])))
+        sigma_mps = float(np.sqrt(np.trace(self.window.filter.velocity_covariance)))
         admitted_m = _STEP_SIGMAS * sigma_mps * duration_s + 0.5 * _ACCEL_OFF_MPS2 * duration_s**2
         return off_m / max(duration_s, 1e-3) if off_m > max(_STEP_M, admitted_m) else 0.0
 

@@ -49,7 +49,7 @@ class ImuSamples:
 
     def between(self, start_ns: int, end_ns: int) -> "ImuSamples":
         """Samples with start_ns <= stamp < end_ns."""
-        a, b = np.searchsorted(self.stamps_ns, [start_ns, end_ns])
+        a, b = self.stamps_ns.searchsorted((start_ns, end_ns))
         return ImuSamples(self.stamps_ns[a:b], self.gyro_radps[a:b], self.accel_mps2[a:b])
 
 
