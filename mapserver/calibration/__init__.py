@@ -2,6 +2,6 @@
 
 from mapserver.calibration.estimate import CalibrationEstimate, ParameterEstimate
 from mapserver.calibration.parameters import CalibrationParameter
-from mapserver.calibration.recordings import estimate_calibration
+from mapserver.calibration.recordings import estimate_calibration, stretches
 
-__all__ = ["CalibrationEstimate", "CalibrationParameter", "ParameterEstimate", "estimate_calibration"]
+__all__ = ["CalibrationEstimate", "CalibrationParameter", "ParameterEstimate", "estimate_calibration", "stretches"]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -23,10 +22,11 @@ from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import begin_survey
 from mapserver.survey.state import Keyframe, SurveyState
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools, Watch
 
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
-Follow = Callable[[Recording, RigCalibration], CalibrationData]
+Follow = Callable[[Recording, RigCalibration, Watch], CalibrationData]
+"""Returns the tracked data of a recording under a calibration; the watch gets every frame."""
 LONGEST_S = 30.0  # of a recording: its stretch with the most motion
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
 _PASSES = 3
@@ -34,15 +34,14 @@ _PASSES = 3
 
 def estimate_calibration(
     recordings: Sequence[Recording],
-    settings: SurveySettings,
-    tools: SurveyTools | None = None,
+    follow: Follow,
     is_enough: IsEnough = lambda *_: False,
-    follow: Follow | None = None,
+    first: CalibrationData | None = None,
 ) -> CalibrationEstimate:
     """Return the calibration estimated from recordings of one rig together.
 
     is_enough: True if an estimate is accurate enough, however far the named parameters are from the given calibration.
-    follow: returns the tracked data of a recording under a calibration; None for its stretch with the most motion.
+    first: the data of a single recording under its own calibration, None if they are not followed yet.
     RecordingError if their calibrations differ; SurveyError if one of them is too short to be tracked.
     """
     rig = recordings[0].calibration
@@ -52,13 +51,11 @@ def estimate_calibration(
                 f"{other.path} has another calibration than {recordings[0].path}; calibrate the rigs one by one, or name the "
                 "calibration that both have with --calibration FILE"
             )
-    if follow is None:
-        fewer = structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES))
-        follow = partial(followed, settings=fewer, tools=tools or SurveyTools())
     estimate, before = None, np.zeros(len(COLUMNS))
     for _ in range(_PASSES):
         current = corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), before) if before.any() else rig
-        estimate = continued_from(before, estimate_from([follow(each, current) for each in recordings]))
+        data = [follow(each, current, lambda _: None) for each in recordings] if first is None else [first]
+        estimate, first = continued_from(before, estimate_from(data)), None
         after = estimate.corrections()
         moved = [p for p, change in zip(COLUMNS, after - before, strict=True) if abs(change) > p.anew_above]
         if not moved or is_enough(estimate, moved):
@@ -78,6 +75,12 @@ def _is_same(rig: RigCalibration, other: RigCalibration) -> bool:
         and np.allclose(a.body_from_cam, b.body_from_cam, atol=1e-9)
         for a, b in zip(rig.cameras, other.cameras, strict=True)
     )
+
+
+def stretches(settings: SurveySettings, tools: SurveyTools) -> Follow:
+    """Return what tracks the stretch of a recording with the most motion."""
+    fewer = structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES))
+    return lambda recording, rig, watch: followed(recording, rig, fewer, replace(tools, watch=watch))
 
 
 def followed(

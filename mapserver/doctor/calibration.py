@@ -5,7 +5,7 @@ baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file 
 errors outside the adjustment: remaining lens distortion, bias of sub-pixel matching, a gyro's scale.
 """
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,13 +17,11 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
+from mapserver.calibration.motion_rows import CalibrationData
 from mapserver.calibration.parameters import COLUMNS, SHOWN
 from mapserver.calibration.recordings import Follow, busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.sensors import SPARSE_S, median_period_s
-from mapserver.survey.executor import Executor
-from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyTools
 
 P = CalibrationParameter
 SURE_SIGMAS = 3.0
@@ -56,19 +54,18 @@ def followed_frames(recording: Recording) -> int:
 
 
 def measure_calibration(
-    recording: Recording, on_frame: Callable[[], None], executor: Executor, follow: Follow | None = None
+    recording: Recording, follow: Follow, first: CalibrationData | None = None
 ) -> MeasuredCalibration:
-    """Measure every parameter of the calibration of a recording with a camera pair, tracked as in `estimate_calibration`.
+    """Measure every parameter of the calibration of a recording with a camera pair. first: as in `estimate_calibration`.
 
     If nothing is wrong the calibration is not refined further: it would be used unchanged.
     """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
         return unknown_calibration(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
-    tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
     try:
         focal_px = Rectifier(recording.calibration).camera.focal_px
-        estimate = estimate_calibration([recording], SurveySettings(), tools, partial(_is_good, focal_px), follow)
+        estimate = estimate_calibration([recording], follow, partial(_is_good, focal_px), first)
     except (RecordingError, SurveyError, np.linalg.LinAlgError) as error:
         return unknown_calibration(
             f"the frames could not be tracked: {error}", "record a drive in the light, with every frame"

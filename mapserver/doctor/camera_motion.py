@@ -12,6 +12,8 @@ from fleetmap.features.stereo import disparities
 from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Stamps
+from mapserver.doctor.sensors import SPARSE_S
+from mapserver.survey.survey_inputs import TrackedFrame
 
 _CORNERS, _MIN_POINTS = 250, 25
 _WINDOW_PX, _LEVELS, _RETURNED_PX = 15, 4, 0.5
@@ -47,6 +49,27 @@ class CameraTurns:
     def only(self, kept: AnyArray) -> "CameraTurns":
         """Return the intervals of a mask or of numbers."""
         return CameraTurns(self.starts_ns[kept], self.ends_ns[kept], self.rates_body_radps[kept], self.ways_m[kept])
+
+
+class OdometryTurns:
+    """The camera's motion as a survey's odometry sees it in the images, as far as they show it. repeats: images like the one before."""
+
+    def __init__(self, body_from_cam: Array) -> None:
+        self._body_from_cam = body_from_cam
+        self._last: RectifiedFrame | None = None
+        self.motions: list[tuple[int, int, Array | None]] = []
+        self.repeats = 0
+
+    def add(self, tracked: TrackedFrame) -> None:
+        """Add the next frame."""
+        before, self._last = self._last, tracked.frame
+        if before is None or tracked.frame.stamp_ns - before.stamp_ns > SPARSE_S * 1e9:
+            return
+        self.repeats += np.array_equal(before.left, tracked.frame.left)
+        seen, mount, motion = tracked.estimate.cam_from_previous, self._body_from_cam, None
+        if seen is not None:
+            motion = mount @ se3_inverse(seen) @ se3_inverse(mount)
+        self.motions.append((before.stamp_ns, tracked.frame.stamp_ns, motion))
 
 
 def body_motion(

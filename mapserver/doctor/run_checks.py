@@ -6,26 +6,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from mapserver.calibration.recordings import Follow
+from mapserver.calibration.motion_rows import CalibrationData
+from mapserver.calibration.recordings import Follow, stretches
 from mapserver.doctor import accelerometer_images, images, sensors
 from mapserver.doctor.accelerometer_images import AxesFit, accelerometer_axes, fit_accelerometer
 from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
-from mapserver.doctor.camera_motion import CameraTurns, body_motion
-from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
+from mapserver.doctor.camera_motion import CameraTurns, OdometryTurns, body_motion
+from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged, worst
 from mapserver.doctor.gyro_images import AXES, GyroFit, gyro_check, turn_upside_down
 from mapserver.doctor.metres import ImageMetres, WheelFit, fit_wheels, judge_metres
 from mapserver.doctor.stereo import ROTATE_BACK, SWAPPED, StereoMatches, epipolar_error, match_stereo, swapped_cameras
 from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyTools, TrackedFrame
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
-SAMPLED_FRAMES = 40
+SAMPLED_FRAMES = 20
 _STEP_S = 0.045  # between two frames for a speed: one step at 20 Hz
-TURN_FRAMES = 200
+TURN_FRAMES = 120
+_EARLY = TURN_FRAMES // 2, TURN_FRAMES  # frames after which a drive is doubted at once, not at its end
+# Above, or with fewer of the frames, the odometry's turns are no certificate
+_CERTAIN_OFFSET_S, _CERTAIN_SHARE = 0.003, 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,35 +119,42 @@ class _Frames:
         return int(starts[np.argmax(total[b] - total[a])])
 
 
-def frames_to_check(recording: Recording, sampled: int = SAMPLED_FRAMES, turn_frames: int = TURN_FRAMES) -> int:
+def frames_to_check(recording: Recording) -> int:
     """Return the approximate number of `on_frame` calls by `run_checks`."""
-    turns = min(turn_frames, len(recording)) if len(recording.imu) else 0
-    return min(sampled, len(recording)) + turns + followed_frames(recording)
+    turns = min(TURN_FRAMES, len(recording)) if len(recording.imu) else 0
+    return min(SAMPLED_FRAMES, len(recording)) + turns + followed_frames(recording)
 
 
 def run_checks(
     recording: Recording,
     on_frame: Callable[[], None] = lambda: None,
-    *,
-    sampled: int = SAMPLED_FRAMES,
-    turn_frames: int = TURN_FRAMES,
     executor: Executor = SERIAL,
     follow: Follow | None = None,
     before_calibration: Callable[[Sequence[Finding]], None] = lambda _: None,
 ) -> CheckResults:
     """Return the findings of all checks of a recording.
 
-    Reads up to `sampled` frames over the recording, a run of `turn_frames`, and with a pair the frames of `follow`, by default the 30 s
-    with the most motion; `on_frame` is called after each. before_calibration: called with the findings before the drive is tracked.
+    Reads SAMPLED_FRAMES over the recording, and with a pair the frames of `follow`, by default the 30 s with the most motion; if these do
+    not certify the IMU, also a run of TURN_FRAMES. `on_frame` is called after each. before_calibration: called with the findings before the
+    calibration is measured.
     """
     imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
     frames = _Frames(recording, on_frame)
-    seen = _sampled(frames, sampled, executor)
+    seen = _sampled(frames, executor)
     soon = _soon_seen(frames, seen)
 
-    turns = CameraTurns.of(executor.map(body_motion, frames.rig, frames.consecutive(turn_frames)))
-    gyro, gyro_fit = gyro_check(turns, imu, shift_s)
+    stamps = [*sensors.camera_checks(recording.frame_stamps_ns), *sensors.imu_checks(imu.stamps_ns)]
+    stamps += [sensors.stamp_order(recording.issues), *sensors.imu_noise(recording.calibration)]
+    follow = follow or stretches(SurveySettings(), SurveyTools(progress=lambda *_: on_frame(), executor=executor))
+    by_turns, data = None, None
+    is_sound = not any(f.verdict is Verdict.FAIL for f in (*stamps, *soon))
+    if has_pair and len(imu) and is_sound and followed_frames(recording):
+        by_turns, data = _by_odometry(frames, soon, follow)
+    if by_turns is None:
+        pairs = frames.consecutive(TURN_FRAMES)
+        by_turns = _by_turns(recording, CameraTurns.of(executor.map(body_motion, frames.rig, pairs)), soon)
+    turns, gyro, gyro_fit, axes, given = by_turns
     upside_down = turn_upside_down(turns, imu, shift_s, frames.rectifier.body_from_cam)
     if has_pair:
         soon = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in soon]
@@ -149,25 +162,23 @@ def run_checks(
         words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
         gyro = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in gyro]
 
-    axes, given = _accelerometer(recording, turns, soon)
     wheels, metres = judge_metres(seen.wheels, given, seen.images, has_imu=len(imu) > 0)
 
-    findings = [*sensors.camera_checks(recording.frame_stamps_ns), *sensors.imu_checks(imu.stamps_ns)]
-    findings += [sensors.stamp_order(recording.issues), *sensors.imu_noise(recording.calibration)]
-    findings += [*soon, *gyro, axes, wheels, metres]
+    findings = [*stamps, *soon, *gyro, axes, wheels, metres]
     before_calibration(findings)
     calibration = MeasuredCalibration([], None)
     if has_pair and gyro_fit is not None and gyro_fit.is_unsteady:
         reason = "the stamps of images and IMU drift against each other"
         calibration = unknown_calibration(reason, "stamp both by one clock, each image at its exposure")
     elif has_pair:
-        used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
-        calibration = measure_calibration(used, on_frame, executor, follow)
+        is_wrong = wheels.verdict is Verdict.FAIL
+        used = replace(recording, wheel=()) if is_wrong else recording
+        calibration = measure_calibration(used, follow, None if is_wrong else data)
 
     findings += [*calibration.findings, images.sharpness([look.variance for look in seen.looks])]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
-        repeats, count = frames.repeats, min(turn_frames, len(recording))
+        repeats, count = frames.repeats, min(TURN_FRAMES, len(recording))
         bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
         limits = Limits(0.02, 0.1, "of the frames")
         findings.append(judge("repeated images", repeats / count, limits, "every frame has an image of its own", bad))
@@ -177,6 +188,56 @@ def run_checks(
     if given is not None and given.metres > 0:
         known["the accelerometer"] = given.metres, given.sigma
     return CheckResults(findings + sensors.other_issues(recording.issues), gyro_fit, calibration, known)
+
+
+class _ByTurns(NamedTuple):
+    """Findings about IMU and images by the camera's turns. given: fit with the given axes of the accelerometer, if they are right."""
+
+    turns: CameraTurns
+    gyro: list[Finding]
+    gyro_fit: GyroFit | None
+    axes: Finding
+    given: AxesFit | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of them; a doubtful offset is no good one."""
+        is_late = self.gyro_fit is not None and abs(self.gyro_fit.offset_s) > _CERTAIN_OFFSET_S
+        return max(worst([*self.gyro, self.axes]), Verdict.WARN if is_late else Verdict.OK, key=list(Verdict).index)
+
+
+def _by_turns(recording: Recording, turns: CameraTurns, soon: Sequence[Finding]) -> _ByTurns:
+    shift_s = recording.calibration.cameras[0].imu_minus_cam_s
+    return _ByTurns(turns, *gyro_check(turns, recording.imu, shift_s), *_accelerometer(recording, turns, soon))
+
+
+class _Doubt(Exception):  # noqa: N818 -- no error: what it ends is done otherwise
+    """The first turns of a drive do not agree with its IMU."""
+
+
+def _by_odometry(
+    frames: _Frames, soon: Sequence[Finding], follow: Follow
+) -> tuple[_ByTurns | None, CalibrationData | None]:
+    """Return the findings by the turns that the odometry of the drive sees, and its data; None as far as they are not certain.
+
+    Odometry searches points where the IMU predicts them: what it says of a sound IMU is right, but who doubts the IMU must not need it.
+    """
+    recording, seen = frames.recording, OdometryTurns(frames.rectifier.body_from_cam)
+
+    def watch(tracked: TrackedFrame) -> None:
+        seen.add(tracked)
+        is_early = len(seen.motions) in _EARLY
+        if is_early and _by_turns(recording, CameraTurns.of(seen.motions), soon).verdict is Verdict.FAIL:
+            raise _Doubt
+
+    try:
+        data = follow(recording, recording.calibration, watch)
+    except (RecordingError, SurveyError, _Doubt):
+        return None, None
+    turns = CameraTurns.of(seen.motions)
+    is_whole = not seen.repeats and len(turns.starts_ns) > _CERTAIN_SHARE * len(seen.motions)
+    found = _by_turns(recording, turns, soon) if is_whole else None
+    return found if found is not None and found.verdict is Verdict.OK else None, data
 
 
 def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Finding]) -> tuple[Finding, AxesFit | None]:
@@ -190,10 +251,10 @@ def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Find
     return axes, next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
 
 
-def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
-    """Return the findings of `run_checks` that need only the IMU and `sampled` frames: for use before a long drive begins."""
+def run_cheap_checks(recording: Recording) -> list[Finding]:
+    """Return the findings of `run_checks` that need only the IMU and SAMPLED_FRAMES: for use before a long drive begins."""
     frames = _Frames(recording, lambda: None)
-    return _soon_seen(frames, _sampled(frames, sampled, SERIAL))
+    return _soon_seen(frames, _sampled(frames, SERIAL))
 
 
 class _Seen(NamedTuple):
@@ -226,8 +287,8 @@ def _soon_seen(frames: _Frames, seen: _Seen) -> list[Finding]:
     return [*findings, images.lens_check(recording, frames.read)]
 
 
-def _sampled(frames: _Frames, count: int, executor: Executor) -> _Seen:
-    looks, recording = list(executor.map(_look, frames.rig, frames.moments(count))), frames.recording
+def _sampled(frames: _Frames, executor: Executor) -> _Seen:
+    looks, recording = list(executor.map(_look, frames.rig, frames.moments(SAMPLED_FRAMES))), frames.recording
     depths = [look.depth_m for look in looks if np.isfinite(look.depth_m)]
     turns = CameraTurns.of(look.motion for look in looks if look.motion is not None)
     metres, wheels, calibration = None, None, recording.calibration

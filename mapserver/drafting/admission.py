@@ -11,7 +11,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter as P
-from mapserver.calibration.recordings import Follow
+from mapserver.calibration.recordings import Follow, stretches
 from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run_checks
 from mapserver.doctor.calibration import SURE_SIGMAS, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
@@ -21,6 +21,8 @@ from mapserver.doctor.rig import further_findings
 from mapserver.doctor.run_checks import CheckResults, run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyTools
 
 # Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth", "repeated images"}
@@ -31,7 +33,6 @@ SUBJECTS = {
     "images against IMU": ("gyro axes",),  # a mirrored video, and another run's IMU
     "pair geometry": ("left and right", "epipolar error", "focal ratio", "pair pitch", "pair yaw", "pair roll"),
 }
-SAMPLED_FRAMES, TURN_FRAMES = 20, 120
 _CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, odometry estimates it itself
 
 
@@ -107,9 +108,8 @@ def checked(
     A certainly wrong parameter is corrected, and the recording measured again: if that finds another error, the
     evidence conflicts and an operator must check it.
     """
-    limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
     refuse = partial(_refuse, recording)
-    checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow, before_calibration=refuse)
+    checks = run_checks(recording, on_frame, executor, follow, refuse)
     refuse(checks.findings)
     used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
@@ -118,7 +118,8 @@ def checked(
     rig, corrections = corrected(recording.calibration, checks.calibration, held)
     again: list[Finding] = []
     if corrections:
-        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor, follow)
+        follow = follow or stretches(SurveySettings(), SurveyTools(executor=executor))
+        measured = measure_calibration(replace(used, calibration=rig), follow)
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
     elif P.TIME_OFFSET.value not in held and gyro_s is not None and abs(gyro_s) >= _CORRECTED_FROM_S:
         corrections = {P.TIME_OFFSET.value: round(gyro_s, 7)}
@@ -162,7 +163,7 @@ def with_further_views(result: CheckedRecording, recording: Recording) -> Checke
 
 def refuse_hopeless(recording: Recording) -> None:
     """Raise RecordingError for what `checked` would refuse, as far as a check within a second shows it, before a useless drive."""
-    _refuse(recording, run_cheap_checks(recording, SAMPLED_FRAMES))
+    _refuse(recording, run_cheap_checks(recording))
 
 
 def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:

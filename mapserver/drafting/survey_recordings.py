@@ -25,19 +25,11 @@ from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory, wheel_between
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.motion_rows import CalibrationData
-from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
+from mapserver.calibration.recordings import LONGEST_S, busiest_frames, busiest_stretch
 from mapserver.doctor.calibration import SURE_SIGMAS
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import (
-    DECISIVE,
-    SAMPLED_FRAMES,
-    TURN_FRAMES,
-    CheckedRecording,
-    checked,
-    leaves_wheels_out,
-    with_further_views,
-)
+from mapserver.drafting.admission import DECISIVE, CheckedRecording, checked, leaves_wheels_out, with_further_views
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.worker import read_ahead
@@ -49,7 +41,7 @@ from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.pose_graph.position_priors import aligned_by_priors
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Zones
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Watch, Zones
 
 _log = logging.getLogger(__name__)
 
@@ -237,7 +229,7 @@ def survey_inputs_of(
     return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)
 
 
-_LONGEST_S = 120.0  # of a drive tracked as a whole; a longer one is judged by its stretch with the most motion
+_TRIED_S = 120.0  # of a drive tracked as a whole under a calibration that is only tried; of a longer one its stretch with the most motion
 
 
 class BegunSurvey:
@@ -250,14 +242,17 @@ class BegunSurvey:
         self._whole, self._indices, self._settings, self._tools = whole, indices, settings, tools
         self._made: tuple[RigCalibration, AdjustedChain] | None = None
 
-    def __call__(self, recording: Recording, rig: RigCalibration) -> CalibrationData:
+    def __call__(self, recording: Recording, rig: RigCalibration, watch: Watch) -> CalibrationData:
         """Return the data of the frames under the calibration `rig`. SurveyError if they are too few to be tracked."""
         calibration, images = with_other_views(rig, self._whole.calibration), self._tools.images
         rectifier, seen = Rectifier(calibration), replace(recording, calibration=calibration, frames=self._whole.frames)
-        inputs = survey_inputs_of(seen, self._indices, rectifier, None)
-        is_believed = rig is recording.calibration
+        is_believed, indices = rig is recording.calibration, self._indices
+        stamps_ns = recording.frame_stamps_ns[indices]
+        if not is_believed and stamps_ns[-1] - stamps_ns[0] > _TRIED_S * 1e9:
+            indices = indices[busiest_frames(stamps_ns, recording.imu)]
+        inputs = survey_inputs_of(seen, indices, rectifier, None)
         with nullcontext(images) if is_believed else images.apart() as images:
-            chain = begin_survey(inputs, self._settings, replace(self._tools, images=images))
+            chain = begin_survey(inputs, self._settings, replace(self._tools, images=images, watch=watch))
             self._tools.at("local adjustment", 1, 1)
             if is_believed:
                 self._made = rig, chain
@@ -269,11 +264,11 @@ class BegunSurvey:
 
     @staticmethod
     def suits(recording: Recording, indices: NDArray[np.int64]) -> bool:
-        """True if the selected frames are consecutive, as informative as any stretch, and few."""
+        """True if the selected frames are consecutive, and as informative as any stretch."""
         stamps_ns = recording.frame_stamps_ns[indices]
         seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
         is_run, is_enough = len(indices) == np.ptp(indices) + 1, len(indices) == len(recording) or seconds >= LONGEST_S
-        return bool(is_run and is_enough and seconds <= _LONGEST_S)
+        return bool(is_run and is_enough)
 
 
 def admit_recordings(
@@ -334,7 +329,7 @@ def _admission(
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
         first = recording.view(0)
-        total, done = frames_to_check(first, SAMPLED_FRAMES, TURN_FRAMES), count(1)
+        total, done = frames_to_check(first), count(1)
         begun = None
         if settings is not None and reading.trajectory is None and BegunSurvey.suits(recording, indices):
             begun = BegunSurvey(recording, indices, settings, tools)

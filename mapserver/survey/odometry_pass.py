@@ -1,7 +1,7 @@
 """The first stage of a survey: odometry over all frames, or poses of another system in its place, with selection of keyframes."""
 
 from collections.abc import Callable, Container, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from mapserver.survey.pose_graph.odometry_factors import odometry_factors
 from mapserver.survey.rig import rig_of, used_cameras
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, Keyframe, KeyframeMotion, Landmarks, OdometryPass, SurveyState, turned
-from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
+from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools, TrackedFrame
 
 LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
@@ -29,17 +29,6 @@ _NO_IDS = np.zeros(0, np.int64)
 _WALK_RAD, _WALK_M = 0.01, 0.05
 _UPRIGHT = np.cos(np.radians(20.0))  # larger than on any ramp
 _UNKNOWN_DEPTH_M = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class TrackedFrame:
-    """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; True if it becomes a keyframe."""
-
-    number: int
-    frame: RectifiedFrame
-    estimate: OdometryEstimate
-    frame_from_body: Array
-    is_keyframe: bool
 
 
 class OdometryRun:
@@ -118,6 +107,7 @@ def followed(
         for raw in inputs.frames:
             tracked = handle(raw if isinstance(raw, RectifiedFrame) else inputs.rectifier.rectify(raw))
             seen.append(FrameTracks.of_frame(tracked.estimate))
+            tools.watch(tracked)
             tools.at("odometry", tracked.number + 1, inputs.frame_count)
             if tracked.is_keyframe:
                 yield tracked.number, tracked.frame

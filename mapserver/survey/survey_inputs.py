@@ -8,6 +8,7 @@ import numpy as np
 
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, inside_rings
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
@@ -18,6 +19,20 @@ from mapserver.survey.tracks.mono_depths import MonoDepths
 
 _RELEASED_EVERY = 4096  # steps of a stage: they read far fewer features than a site has
 Progress = Callable[[str, int, int], None]  # stage, done, total
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; True if it becomes a keyframe."""
+
+    number: int
+    frame: RectifiedFrame
+    estimate: OdometryEstimate
+    frame_from_body: Array
+    is_keyframe: bool
+
+
+Watch = Callable[[TrackedFrame], None]
 
 
 class FrameParts(Protocol):
@@ -82,11 +97,12 @@ class SurveyConfig:
 
 @dataclass(frozen=True)
 class SurveyTools:
-    """Resources that do not change the result."""
+    """Resources that do not change the result. watch: gets every frame that the odometry has tracked, but none of a survey by segments."""
 
     progress: Progress = field(default=lambda *_: None)
     images: ImageStore = field(default_factory=ImageStore)
     executor: Executor = SERIAL
+    watch: Watch = field(default=lambda _: None)
 
     def at(self, stage: str, done: int, total: int) -> None:
         """Report progress; features of keyframes leave memory periodically, and at the end of the stage."""

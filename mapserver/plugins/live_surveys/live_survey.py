@@ -34,10 +34,10 @@ from mapserver.plugins.live_surveys.message import (
     joined_imu,
     thinning,
 )
-from mapserver.survey.odometry_pass import OdometryRun, TrackedFrame
+from mapserver.survey.odometry_pass import OdometryRun
 from mapserver.survey.pose_graph.odometry_factors import FLOOR, INERTIAL_FLOOR, step_covariance
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey.survey_inputs import SurveyConfig, TrackedFrame
 
 _TORN_M2 = 100.0
 _TELL_EVERY_S = 0.5

@@ -50,7 +50,7 @@ def calibrate(
     if guess is not None:
         _from_guess(recordings, out, guess, config_path(context), topics)
         return
-    from mapserver.calibration import estimate_calibration
+    from mapserver.calibration import estimate_calibration, stretches
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
@@ -58,7 +58,7 @@ def calibrate(
         recorded = [opened.enter_context(open_recording(path, how)) for path in recordings]
         sources = [_sound(recording.view(0)) for recording in recorded]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
-        estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
+        estimate = estimate_calibration(sources, stretches(settings, opened.enter_context(_shown())))
         rig = recorded[0].calibration
     title = f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
     verdicts = ("measured" if p.is_judged else f"not judged: {p.reason}" for p in estimate.parameters)

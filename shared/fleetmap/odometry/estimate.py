@@ -31,7 +31,8 @@ class OdometryEstimate:
     imu_minus_cam_s is the estimated time offset, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
     scale_known is False for one camera of unknown scale: lengths are then in an arbitrary unit. revised:
     earlier frames with new poses, (frame index, odom_from_body (4, 4)). is_lifted: a ground robot leaves the ground. is_bridged: samples of
-    the IMU are missing since the frame before, the images alone show the motion.
+    the IMU are missing since the frame before, the images alone show the motion. cam_from_previous (4, 4): motion since the frame before by
+    the images alone, None if they do not show it.
     """
 
     stamp_ns: int
@@ -56,6 +57,7 @@ class OdometryEstimate:
     previous_from_body: Array | None = None
     is_lifted: bool = False
     is_bridged: bool = False
+    cam_from_previous: Array | None = None
 
 
 def is_away(last_ns: int, estimate: OdometryEstimate) -> bool:

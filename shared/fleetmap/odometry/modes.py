@@ -130,6 +130,7 @@ class Mode(ABC):
             "track_pixels": tracked.pixels,
             "inlier_share": tracked.inlier_share,
             "after_gap": tracked.by_descriptors,
+            "cam_from_previous": _well_seen(tracked),
             "new_odom_from_old_odom": step.new_odom_from_old_odom,
             "revised": step.revised,
             "is_lifted": step.is_lifted,
@@ -162,9 +163,7 @@ class WindowMode(Mode):
 
     def _show(self, imu: ImuInputs, stamp_ns: int, tracked: Tracked) -> bool:
         """Run the checks of the IMU on a frame; stamp_ns on its calibrated clock. Return True if they found a fault."""
-        seen, samples = tracked.cam_from_previous, imu.samples
-        if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE:
-            seen = None  # poorly tracked images are no evidence against a sensor
+        seen, samples = _well_seen(tracked), imu.samples
         moved = None if seen is None else self._body_from_next(seen)
         imu.clock.handle(stamp_ns, moved, samples.imu)
         if imu.accelerometer is not None:
@@ -218,6 +217,11 @@ class WindowMode(Mode):
         body_from_cam = se3_adjoint(self._rig.body_from_cam)
         wide = sigmas**2 * np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
+
+
+def _well_seen(tracked: Tracked) -> Array | None:
+    """Return cam_from_previous (4, 4) unless images are tracked poorly: those are no evidence against a sensor."""
+    return None if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE else tracked.cam_from_previous
 
 
 def _with_matches(tracked: Tracked, kept: Iterable[Earlier]) -> Tracked:

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from fleetmap.errors import FleetmapError, StoreError, SurveyError
 from fleetmap.recordings import Recording, open_recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
 from mapserver.calibration.motion_rows import CalibrationData
@@ -16,8 +17,6 @@ from mapserver.calibration.parameters import COLUMNS
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import MeasuredCalibration, corrected, findings_of, in_words, measure_calibration
 from mapserver.drafting.admission import rig_evidence
-from mapserver.survey.executor import SERIAL
-from mapserver.survey.settings import SurveySettings
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration
 from support.worlds.calibration_scene import estimate
@@ -71,13 +70,16 @@ def test_frames_are_followed_again_only_where_that_may_change_a_verdict(
     """A principal point that moved by 3.5 px is none that a robot would notice, and the recording is used as it is."""
     turned = {"camera_imu_y": off["principal_x"] / Rectifier(calibration()).camera.focal_px}  # which looks the same
     followed: list[object] = []
-    monkeypatch.setattr(recordings, "followed", lambda _, rig, **__: followed.append(rig))
     monkeypatch.setattr(recordings, "estimate_from", lambda _: estimate(**off, **turned))
     stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
     recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
-    measure_calibration(recording, lambda: None, SERIAL)
+
+    def follow(_: Recording, rig: RigCalibration, __: object) -> Any:
+        followed.append(rig)
+
+    measure_calibration(recording, follow)
     assert (len(followed) == 1) == is_enough
-    recordings.estimate_calibration([recording], SurveySettings())
+    recordings.estimate_calibration([recording], follow)
     assert len(followed) > 2, "who writes the calibration wants the best one"
 
 
@@ -133,15 +135,15 @@ def test_only_what_the_frames_lack_is_not_judged(error: FleetmapError) -> None:
     recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
     if isinstance(error, StoreError):
         with pytest.raises(StoreError, match="the disk is full"):
-            measure_calibration(recording, lambda: None, SERIAL, follow)
+            measure_calibration(recording, follow)
     else:
-        found = measure_calibration(recording, lambda: None, SERIAL, follow)
+        found = measure_calibration(recording, follow)
         assert "it is dark" in found.findings[0].sentence
 
 
 def test_keyframes_alone_are_not_judged() -> None:
     recording = open_recording(real_data("euroc_v101_keyframes"))
-    found = measure_calibration(recording, lambda: None, SERIAL)
+    found = measure_calibration(recording, lambda *_: pytest.fail("was followed"))
     assert {f.verdict for f in found.findings} == {Verdict.NOT_JUDGED}
     assert all("record every frame" in f.missing for f in found.findings)
     assert found.wrong() == []

@@ -39,7 +39,8 @@ def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.fixture
 def _quick(monkeypatch: pytest.MonkeyPatch, seen: dict[object, object]) -> None:
-    """Without the adjustment of the calibration, and with what was seen in the same images before."""
+    """Without the odometry and the adjustment of the calibration, and with what was seen in the same images before."""
+    monkeypatch.setattr(run_checks, "_by_odometry", lambda *_: (None, None))
     monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))
     for module, name in ((camera_motion, "motion_between"), (run_checks, "match_stereo")):
         monkeypatch.setattr(module, name, remembered(getattr(module, name), seen))
@@ -136,7 +137,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_what_everything_contradicts_is_named(ride: Recording, case: str) -> None:
     change, faults = CASES[case]
-    findings = run_checks.run_checks(change(ride), sampled=20).findings
+    findings = run_checks.run_checks(change(ride)).findings
     failed = {f.name: f.sentence for f in findings if f.verdict is Verdict.FAIL}
     assert failed.keys() == faults.keys(), failed
     for name, words in faults.items():
@@ -185,7 +186,7 @@ def test_a_ros_1_bag_with_a_fault_is_named_alike(
             messages.append((channel.topic, full.replace("/msg/", "/"), message.log_time, data))
     with open_recording(write_rosbag1(tmp_path / "ride.bag", messages)) as bag:
         assert (len(bag), len(bag.imu), bag.issues) == (len(ride), len(ride.imu), ())
-        found = {f.name: f for f in run_checks.run_checks(bag, sampled=20, turn_frames=60).findings}
+        found = {f.name: f for f in run_checks.run_checks(bag).findings}
     assert found[name].verdict is Verdict.FAIL
     assert says in found[name].sentence
 
@@ -209,7 +210,7 @@ def test_depths_in_another_unit(
     with open_recording(path) as good:
         wheels = good.wheel if has_wheels else ()
         scaled = changed(good, lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(factor)))
-        found = run_checks.run_checks(replace(scaled, wheel=wheels), sampled=20)
+        found = run_checks.run_checks(replace(scaled, wheel=wheels))
     failed = {f.name: f.sentence for f in found.findings if f.verdict is Verdict.FAIL}
     assert (says in failed["metric scale"]) if says else not failed
     assert "wheels" not in failed
@@ -229,7 +230,7 @@ def test_dots_of_a_projector_that_moves_with_the_camera(ride: Recording, brightn
 
 @pytest.mark.usefixtures("_quick")
 def test_one_camera_turns_and_shows_no_metres(ride: Recording) -> None:
-    findings = {f.name: f for f in run_checks.run_checks(reduced(ride, SensorSet.MONO_INERTIAL), sampled=20).findings}
+    findings = {f.name: f for f in run_checks.run_checks(reduced(ride, SensorSet.MONO_INERTIAL)).findings}
     assert findings["gyro axes"].verdict is not Verdict.NOT_JUDGED
     metric = [findings[name].verdict for name in ("wheels", "metric scale", "accelerometer axes")]
     assert metric == [Verdict.OK, Verdict.NOT_JUDGED, Verdict.NOT_JUDGED]  # of the wheels, the yaw rate
@@ -244,7 +245,7 @@ def test_images_that_repeat_are_told_from_rest(ride: Recording) -> None:
             shown = ride.read_frame(index - (index % 3 == 2))
             return replace(shown, stamp_ns=int(ride.frame_stamps_ns[index]))
 
-    findings = run_checks.run_checks(replace(ride, frames=Repeating()), sampled=20).findings  # type: ignore[arg-type]
+    findings = run_checks.run_checks(replace(ride, frames=Repeating())).findings  # type: ignore[arg-type]
     failed = {f.name for f in findings if f.verdict is Verdict.FAIL}
     assert "repeated images" in failed
     assert "wheels" not in failed

@@ -34,7 +34,7 @@ from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.pinhole_pair import CAMERA
 
@@ -100,6 +100,10 @@ def test_a_recording_that_cannot_be_used_is_closed(
     assert closed == [8]
 
 
+def unwatched(_: object) -> None:
+    pass
+
+
 def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,19 +111,29 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
 
     The pictures of one that was tried do not fill the build's file.
     """
-    monkeypatch.setattr(survey_recordings, "begin_survey", lambda _inputs, _settings, tools: [tools.images])
+    frames = []
+
+    def begin(inputs: SurveyInputs, _: SurveySettings, tools: SurveyTools) -> Any:
+        frames.append(inputs.frame_count)
+        return [tools.images]
+
+    monkeypatch.setattr(survey_recordings, "begin_survey", begin)
     monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
     with open_recording(drive) as recording, mapped_images.MappedImageStore(tmp_path) as images:
         begun = BegunSurvey(recording, np.arange(8), SurveySettings(), SurveyTools(images=images))
         given = recording.calibration
         tried, corrected = replace(given), replace(given)
         assert begun.chain_of(given) is None
-        first = begun(recording, given)
-        assert begun(recording, tried) != [images]
+        first = begun(recording, given, unwatched)
+        assert begun(recording, tried, unwatched) != [images]
         assert [begun.chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
-        second = begun(replace(recording, calibration=corrected), corrected)
+        second = begun(replace(recording, calibration=corrected), corrected, unwatched)
         assert [begun.chain_of(rig) for rig in (given, corrected)] == [None, second]
         assert first == second == [images]
+        long = replace(recording, frame_stamps_ns=np.arange(8, dtype=np.int64) * 20_000_000_000)
+        begun(long, tried, unwatched)
+        begun(long, given, unwatched)
+        assert frames == [8, 8, 8, 2, 8]  # what is tried for a long drive is its busiest half minute
 
 
 @pytest.mark.parametrize(
@@ -193,11 +207,13 @@ def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
         (600, 20.0, slice(300), False),  # 15 s of it, where its busiest 30 s say more
         (1200, 20.0, slice(700), True),
         (1200, 20.0, slice(None, None, 2), False),
-        (1300, 10.0, slice(None), False),  # over two minutes
+        (1300, 10.0, slice(None), True),  # over two minutes
         (1, 20.0, slice(None), True),
     ],
 )
-def test_a_short_drive_is_followed_as_a_whole(drive: Path, frames: int, hz: float, chosen: slice, suits: bool) -> None:
+def test_a_drive_without_gaps_is_followed_as_a_whole(
+    drive: Path, frames: int, hz: float, chosen: slice, suits: bool
+) -> None:
     with open_recording(drive) as recording:
         stamps_ns = (np.arange(frames) * 1e9 / hz).astype(np.int64)
         assert BegunSurvey.suits(replace(recording, frame_stamps_ns=stamps_ns), np.arange(frames)[chosen]) is suits
