@@ -1,4 +1,4 @@
-"""PNG files: their checksums, and the pixels of those that cameras write, in a third of the time that OpenCV's zlib and libpng take.
+"""PNG files: their checksums, and the pixels of those that cameras write, in half of the time that OpenCV's zlib and libpng take.
 
 Source: Portable Network Graphics (PNG) Specification, third edition.
 """
@@ -21,9 +21,8 @@ _zlib: Any = import_module("isal.isal_zlib" if find_spec("isal") else "zlib")
 PNG_START = b"\x89PNG\r\n\x1a\n"
 _PIXEL_BYTES = {(8, 0): 1, (16, 0): 2, (8, 2): 3}  # by bits and kind of colour: grey, and red, green and blue
 _HEAD = struct.Struct(">IIBBBBB")
-# Chunks that change pixels: a colour that is transparent, and further pictures. Those with a capital letter must be understood.
-_CHANGING = {b"tRNS", b"acTL"}
-_UNDERSTOOD = {b"IHDR", b"IDAT", b"IEND"}
+# Chunks of files that are read here: those with pixels, and those that change none.
+_PLAIN = {b"IHDR", b"IDAT", b"IEND", b"cHRM", b"eXIf", b"gAMA", b"iCCP", b"pHYs", b"sBIT", b"sRGB", b"tEXt", b"tIME"}
 
 
 def is_damaged_png(data: bytes) -> bool:
@@ -53,29 +52,19 @@ def plain_png_pixels(data: bytes) -> AnyArray | None:
 
     None for a file that is damaged, large, or of another kind, such as interlaced ones and those with a palette: let OpenCV judge it.
     """
-    if not data.startswith(PNG_START):
+    chunks = list(_chunks(data)) if data.startswith(PNG_START) else []
+    if not chunks or not {kind for kind, _ in chunks} <= _PLAIN:
         return None
-    chunks = list(_chunks(data))
-    kinds = {kind for kind, _ in chunks}
-    if None in kinds or any(
-        kind in _CHANGING or (kind[:1].isupper() and kind not in _UNDERSTOOD) for kind in kinds if kind
-    ):
-        return None
-    if not chunks or chunks[0][0] != b"IHDR" or len(chunks[0][1]) != _HEAD.size:
-        return None
-    width, height, bits, colour, *others = _HEAD.unpack(chunks[0][1])
-    pixel_bytes = _PIXEL_BYTES.get((bits, colour), 0)
-    if not (0 < width * height <= MAX_PIXELS and pixel_bytes) or any(others):
-        return None
-    row_bytes = 1 + width * pixel_bytes
-    inflating = _zlib.decompressobj()
+    inflating, packed = _zlib.decompressobj(), b"".join(content for kind, content in chunks if kind == b"IDAT")
     try:
-        inflated = inflating.decompress(
-            b"".join(content for kind, content in chunks if kind == b"IDAT"), height * row_bytes + 1
-        )
-        filtered = np.frombuffer(inflated, np.uint8).reshape(height, row_bytes)
-        rows = core.png_rows(filtered, pixel_bytes)
-    except (_zlib.error, ValueError):
+        width, height, bits, colour, *others = _HEAD.unpack(chunks[0][1])
+        pixel_bytes = _PIXEL_BYTES[bits, colour]
+        row_bytes = 1 + width * pixel_bytes
+        if any(others) or width * height > MAX_PIXELS:
+            return None
+        filtered = np.frombuffer(inflating.decompress(packed, height * row_bytes + 1), np.uint8)
+        rows = core.png_rows(filtered.reshape(height, row_bytes), pixel_bytes)
+    except (struct.error, KeyError, ValueError, _zlib.error):
         return None
     if not inflating.eof:
         return None
