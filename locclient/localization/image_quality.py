@@ -1,13 +1,11 @@
 """Image quality of a frame: exposure, sharpness, and faults. Pure."""
 
-from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Annotated
+from statistics import median
 
 import numpy as np
-from msgspec import Meta
 
 from fleetmap import core
 from fleetmap.config import Section
@@ -26,7 +24,7 @@ class ImageQualitySettings(Section, frozen=True):
     dark_contrast: float = 4.0
     glare_share: float = 0.6
     blurred_share: float = 0.1
-    typical_frames: Annotated[int, Meta(ge=1)] = 150  # for the average contrast and depth
+    typical_frames: int = 150  # for the average contrast and depth
     occluded_depth_share: float = 0.4
 
 
@@ -53,7 +51,8 @@ class ImageQualityMonitor:
         self._settings = settings
         self._last = [b"", b""]
         self._frozen = [False, False]
-        self._sharpness, self._depths_m = (_Latest(settings.typical_frames) for _ in range(2))
+        self._sharpness: deque[float] = deque(maxlen=settings.typical_frames)
+        self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
 
     def judge(self, frame: RectifiedFrame | CameraFrame) -> ImageQuality:
         """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
@@ -61,12 +60,12 @@ class ImageQualityMonitor:
         self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
         count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
         variance = squares / count - (total / count) ** 2
-        typical = self._sharpness.median(variance)
+        typical = median(self._sharpness) if self._sharpness else variance
         cause = self._exposure_fault(thinned[0])
         if cause is Cause.NONE and any(self._frozen):
             cause = Cause.FROZEN
         if cause is Cause.NONE:
-            self._sharpness.add(variance)
+            self._sharpness.append(variance)
             cause = Cause.BLURRED if variance < self._settings.blurred_share * typical else Cause.NONE
         return ImageQuality(cause, thinned[0].mean / 255.0, variance / max(typical, 1e-9))
 
@@ -77,9 +76,10 @@ class ImageQualityMonitor:
 
     def judge_depth(self, scene_depth_m: float) -> Cause:
         """Return OCCLUDED if the scene is much nearer than usual: an object is in front of the cameras."""
-        if scene_depth_m < self._settings.occluded_depth_share * self._depths_m.median(scene_depth_m):
+        typical_m = median(self._depths_m) if self._depths_m else scene_depth_m
+        if scene_depth_m < self._settings.occluded_depth_share * typical_m:
             return Cause.OCCLUDED
-        self._depths_m.add(scene_depth_m)
+        self._depths_m.append(scene_depth_m)
         return Cause.NONE
 
     def _exposure_fault(self, left: "_ThinnedImage") -> Cause:
@@ -107,20 +107,3 @@ class _ThinnedImage:
         pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
         mean, count = total / len(pixels), len(pixels)
         return cls(pixels, mean, sqrt(max(squares / count - mean * mean, 0.0)), brights / count)
-
-
-class _Latest:
-    """The last values of a figure, also in order of size."""
-
-    def __init__(self, count: int) -> None:
-        self._values, self._in_order = deque[float](maxlen=count), list[float]()
-
-    def add(self, value: float) -> None:
-        if len(self._values) == self._values.maxlen:
-            del self._in_order[bisect_left(self._in_order, self._values[0])]
-        self._values.append(value)
-        insort(self._in_order, value)
-
-    def median(self, default: float) -> float:
-        known, count = self._in_order, len(self._in_order)
-        return (known[(count - 1) // 2] + known[count // 2]) / 2 if known else default

@@ -5,6 +5,8 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
+#else
+#include <arm_neon.h>
 #endif
 
 namespace fleetmap {
@@ -24,26 +26,13 @@ inline Bytes interleaved(Bytes a, Bytes b) { return Bytes(_mm_unpacklo_epi8(__m1
 inline Words sums_of_pairs(Bytes a, Bytes b) { return Words(_mm_maddubs_epi16(__m128i(a), __m128i(b))); }
 inline Words high_product(Words a, Words b) { return Words(_mm_mulhi_epi16(__m128i(a), __m128i(b))); }
 #else
-inline Bytes chosen(Bytes from, Bytes numbers) {
-  Bytes out;
-  for (ptrdiff_t k = 0; k < kReach; ++k) out[k] = from[numbers[k]];
-  return out;
-}
-inline Bytes interleaved(Bytes a, Bytes b) {
-  Bytes out;
-  for (ptrdiff_t k = 0; k < kReach; ++k) out[k] = (k % 2 ? b : a)[k / 2];
-  return out;
-}
+inline Bytes chosen(Bytes from, Bytes numbers) { return Bytes(vqtbl1q_u8(uint8x16_t(from), uint8x16_t(numbers))); }
+inline Bytes interleaved(Bytes a, Bytes b) { return Bytes(vzip1q_u8(uint8x16_t(a), uint8x16_t(b))); }
 inline Words sums_of_pairs(Bytes a, Bytes b) {
-  Words out;
-  for (ptrdiff_t k = 0; k < kBlock; ++k) out[k] = int16_t(a[2 * k] * b[2 * k] + a[2 * k + 1] * b[2 * k + 1]);
-  return out;
+  const uint8x16_t left(a), right(b);
+  return Words(vpaddq_u16(vmull_u8(vget_low_u8(left), vget_low_u8(right)), vmull_high_u8(left, right)));
 }
-inline Words high_product(Words a, Words b) {
-  Words out;
-  for (ptrdiff_t k = 0; k < kBlock; ++k) out[k] = int16_t((a[k] * b[k]) >> 16);
-  return out;
-}
+inline Words high_product(Words a, Words b) { return Words(vqdmulhq_s16(int16x8_t(a), int16x8_t(b))) >> 1; }
 #endif
 
 inline Bytes half(const uint8_t (&from)[kBlock]) {
@@ -66,7 +55,8 @@ struct Block {
 
   void make(const uint8_t* source, ptrdiff_t width, uint8_t* to) const {
     const Bytes left = half(column), falls = half(is_lower), shares = half(right);
-    const Bytes columns = interleaved(left, left + 1), lower = interleaved(falls, falls), along = interleaved(kShares - shares, shares);
+    const Bytes columns = interleaved(left, left + 1), lower = interleaved(falls, falls),
+                along = interleaved(uint8_t(kShares) - shares, shares);
     Bytes rows[3];
     for (ptrdiff_t v = 0; v < 3; ++v) {
       std::memcpy(&rows[v], source + at + v * width, kReach);
