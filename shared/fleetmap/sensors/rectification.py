@@ -217,8 +217,7 @@ class Rectifier:
             depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
             disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
             if self._maps[0] is not None:
-                nearest = cv2.remap(disparity, *self._maps[0][1], cv2.INTER_NEAREST, borderValue=float("nan"))
-                disparity = np.asarray(nearest, np.float32)
+                disparity = np.append(disparity, np.float32(np.nan))[self._maps[0][1]]
         others = (self._other(*each) for each in zip(frame.others, self.others, strict=False))
         return RectifiedFrame(frame.stamp_ns, left, right, disparity, tuple(others))
 
@@ -276,8 +275,9 @@ def _remap_tables(
     distortion: tuple[float, ...],
     cam_from_rect: tuple[float, ...],
     mask: tuple[Polygon, ...],
-) -> tuple[tuple[core.Remap, tuple[NDArray[np.int16], NDArray[np.uint16]]] | None, NDArray[np.bool_] | None]:
-    """Fixed-point look-up tables, also for cv2.remap, or None if the image is already rectified (as KITTI's); and the rectified mask."""
+) -> tuple[tuple[core.Remap, NDArray[np.int32]] | None, NDArray[np.bool_] | None]:
+    """Fixed-point look-up tables, and (H, W) the index of the nearest pixel, -1 outside the image; None if the image is already rectified
+    (as KITTI's). And the rectified mask."""
     v, u = np.indices((rectified.height_px, rectified.width_px), np.float64)
     x, y = (u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px
     rays = np.stack([x, y, np.ones_like(u)], -1).reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
@@ -295,8 +295,11 @@ def _remap_tables(
         return None, hidden
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
     first, second = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
-    tables = np.asarray(first, np.int16), np.asarray(second, np.uint16)
-    return (core.Remap(*tables, size_px[1], size_px[0]), tables), hidden
+    whole, parts = np.asarray(first, np.int16), np.asarray(second, np.uint16)  # of 1/32 px, x in the lower five bits
+    nearest = whole + ((parts[..., None] >> np.array([0, 5], np.uint16)) % 32 >= 16)
+    is_inside = ((nearest >= 0) & (nearest < size_px)).all(axis=2)
+    indices = np.where(is_inside, nearest @ np.array([1, size_px[0]]), -1).astype(np.int32)
+    return (core.Remap(whole, parts, size_px[1], size_px[0]), indices), hidden
 
 
 def _clearance_px(hidden: NDArray[np.bool_] | None) -> Image | None:

@@ -104,7 +104,9 @@ def _view(map_from_cam: Array) -> tuple[Image, NDArray[np.float32]]:
     face = 2 * axis + (np.take_along_axis(rays, axis[..., None], -1)[..., 0] > 0)
     across = np.where(axis == 0, hit[..., 1], hit[..., 0])
     along = np.where(axis == 2, hit[..., 1], hit[..., 2]) + face * _TEXELS
-    grey = cv2.remap(_paint(), across.astype(np.float32), along.astype(np.float32), cv2.INTER_LINEAR)
+    grey = cv2.remap(
+        _paint(), *cv2.convertMaps(across.astype(np.float32), along.astype(np.float32), cv2.CV_16SC2), cv2.INTER_LINEAR
+    )
     return np.asarray(grey, np.uint8), depth_m[..., 0].astype(np.float32)
 
 

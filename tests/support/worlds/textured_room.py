@@ -61,7 +61,7 @@ def view(map_from_cam: Array, seed: int = 1) -> NDArray[np.uint8]:
     wall = 2 * axis + positive
     x = (first * _PIXELS_PER_M + _SIDE / 2).astype(np.float32)
     y = (second * _PIXELS_PER_M + _SIDE / 2 + wall * _SIDE).astype(np.float32)
-    return np.asarray(cv2.remap(_walls(seed), x, y, cv2.INTER_LINEAR), np.uint8)
+    return np.asarray(cv2.remap(_walls(seed), *cv2.convertMaps(x, y, cv2.CV_16SC2), cv2.INTER_LINEAR), np.uint8)
 
 
 @lru_cache(maxsize=400)
