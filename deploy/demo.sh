@@ -14,6 +14,7 @@ BIN=${BIN:-.venv/bin}
 OUT=${OUT:-out/demo}
 SEED=${SEED:-1}
 ROBOTS=(tote-1 tote-2)
+ROBOT_FRAMES=180  # 12 s of driving
 READY_WITHIN_S=60
 server_pid=
 robots_pid=
@@ -118,7 +119,8 @@ replay() {
 
 record() {
   local scenario=$1 robot=$2 day=$3
-  "$BIN/fleetsim" record "$scenario" --out "$OUT/$robot.mcap" --seed "$SEED" --day "$day" --robot "$robot"
+  shift 3
+  "$BIN/fleetsim" record "$scenario" --out "$OUT/$robot.mcap" --seed "$SEED" --day "$day" --robot "$robot" "$@"
 }
 
 half_of() {
@@ -138,8 +140,11 @@ half_of() {
 
 warehouse() {
   local robot number
-  # The simulator draws the next day's recordings on the other core meanwhile; no robot has them before the map is there.
-  (record clip carried 1 && for robot in "${ROBOTS[@]}"; do record small-loop "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
+  # The simulator draws the next day's recordings with what survey and build leave idle; no robot has them before the map is there.
+  (
+    renice -n 5 "$BASHPID"
+    record clip carried 1 && for robot in "${ROBOTS[@]}"; do record small-loop "$robot" 1 --frames "$ROBOT_FRAMES"; done
+  ) >"$OUT/robots.log" 2>&1 &
   robots_pid=$!
   say "a survey robot drives through a simulated warehouse"
   record small-loop survey 0
