@@ -116,7 +116,7 @@ acceptance: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
 
 profile: core
-	PYTHONPATH=tests $(BIN)/python tests/benchmarks/profiled.py $(RECORDING)
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.profiled $(RECORDING)
 
 study: core
 	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=warehouse"; exit 2; }

@@ -1,6 +1,6 @@
 """Where the CPU seconds of a build and of a robot's frame go: by stage, compiled code apart from Python, decoding apart from both.
 
-    PYTHONPATH=tests python tests/benchmarks/profiled.py [RECORDING]     (`make profile`; without a RECORDING into docs/performance.md)
+    PYTHONPATH=tests python -m benchmarks.profiled [RECORDING]     (`make profile`; without a RECORDING into docs/performance.md)
 
 Each thread's CPU clock is read where a stage, a function of the core or of OpenCV, or a pool's task begins and ends; what passed since the
 thread's last look belongs to what it did until then. A task belongs to the stage that submitted it. Nothing is sampled, so that other
@@ -26,6 +26,7 @@ import cv2
 
 from benchmarks.common.recorded_runs import kept_folder, played, recorded, surveyed
 from fleetmap import _core
+from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.sensors.rectification import Rectifier
 from locclient.localization.map_query import MapQuery
@@ -48,6 +49,7 @@ OTHER = "other"
 # What each begins; one inside another is taken from it. A generator's work is not its call's.
 STAGES: dict[str, dict[str, list[Function]]] = {
     "build": {
+        "opening, hashing": [open_recording, Recording.readable, Recording.content_hash],
         "examination": [checked],
         "self-calibration": [estimate_calibration],
         "rectification": [Rectifier.rectify],
