@@ -6,8 +6,8 @@
 namespace fleetmap {
 namespace {
 
-constexpr double kNearest = 0.05;          // metres ahead of the camera
-constexpr double kBehindSigmas = 1000.0;   // residual of a landmark behind it: beyond every cutoff, with zero slope
+constexpr double kNearest = 0.05;           // metres ahead of the camera
+constexpr double kBehindSigmas = 1000.0;    // residual of a landmark behind it: beyond every cutoff, with zero slope
 constexpr size_t kRows = 4, kColumns = 64;  // of an observation; of a calibration, at most
 
 using Poses = Array<double, -1, 4, 4>;
@@ -16,7 +16,8 @@ using Turns = Array<double, -1, 2, 2>;
 // What is nearly constant near a state: slopes (M, 4, C) and (M, 2, 2, C) of the measured rows and of as_given, rates_map (K, 3), motions
 // (K, 9), slopes of right_m by the baseline and its direction, the columns of turn, shift, time offset, focal ratio and those three of the
 // baseline, and the focal ratio.
-using Slopes = std::tuple<Array<double, -1, 4, -1>, Array<double, -1, 2, 2, -1>, Points, Array<double, -1, 9>, Mat3, Array<int64_t, 7>, double>;
+using Slopes =
+    std::tuple<Array<double, -1, 4, -1>, Array<double, -1, 2, 2, -1>, Points, Array<double, -1, 9>, Mat3, Array<int64_t, 7>, double>;
 
 struct Pinhole {
   double focal, cx, cy;

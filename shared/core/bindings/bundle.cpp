@@ -63,7 +63,8 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
   check(by_point.shape(0) >= derived && by_calibration.shape(0) >= derived && by_calibration.shape(2) == state.calibration.size(),
         "rows: derivatives of each observation, by all of the calibration");
   check_rows(state.map_from_body.size(), "rows: a position for each keyframe", positions);
-  return {residuals.data(), by_point.data(), by_calibration.data(), shares.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
+  const auto* const places = reinterpret_cast<const Vec3*>(positions.data());
+  return {residuals.data(), by_point.data(), by_calibration.data(), shares.data(), places, kept(rows)};
 }
 
 void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cams, const Poses& map_from_body, const Table& motions,

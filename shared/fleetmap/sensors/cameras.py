@@ -64,9 +64,9 @@ class RadialTangential(CameraModel):
         lens = _coefficients(distortion)
         goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
         x, y = core.undistort(np.array(lens), goal_x, goal_y)
-        back_x, back_y = _distort(lens, x, y)
-        missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < _radial_limit(lens)))
         rays = np.stack([x, y, np.ones_like(x)], axis=1)
+        back = core.pixels_of_rays(rays, np.array([1.0, 1.0, 0.0, 0.0]), np.array(lens), _radial_limit(lens))
+        missed = ~(np.hypot(back[:, 0] - goal_x, back[:, 1] - goal_y) < 1e-7)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rays[missed] = np.nan
         return np.asarray(rays)
@@ -79,14 +79,6 @@ class RadialTangential(CameraModel):
 def _coefficients(distortion: Array) -> Lens:
     k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(np.asarray(distortion, np.float64), (0, 8 - len(distortion))).tolist()
     return k1, k2, p1, p2, k3, k4, k5, k6
-
-
-def _distort(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
-    k1, k2, p1, p2, k3, k4, k5, k6 = lens
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    distorted_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return distorted_x, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
 @lru_cache(maxsize=16)
