@@ -8,7 +8,7 @@ namespace fleetmap {
 namespace {
 
 constexpr int kIterations = 12;
-constexpr double kStep = 1e-6;
+constexpr double kStep = 1e-6, kMissed = 1e-7;
 constexpr double kNearest = 1e-9;
 constexpr double kLargestAngle = 3.1;  // of equidistant lenses: straight back has no pixel
 
@@ -62,8 +62,9 @@ bool is_seen(const Sphere& lens, double reach, Vec3 point, double* image) {
   return grows && is_seen(lens.plane, reach, Vec3{point[0], point[1], lens.a * d2 + lens.b * w}, image);
 }
 
-// The points (x, y) of the plane z = 1 that the lens maps to the goals: Newton's method with a numeric Jacobian, not checked.
-auto undistort(const Array<double, 8>& coefficients, const Reals& goals_x, const Reals& goals_y) {
+// The points (x, y) of the plane z = 1 that the lens maps to the goals: Newton's method with a numeric Jacobian; NaN where it does
+// not converge, or the image has folded back, at x^2 + y^2 from `reach` on.
+auto undistort(const Array<double, 8>& coefficients, double reach, const Reals& goals_x, const Reals& goals_y) {
   const size_t count = goals_x.shape(0);
   check_rows(count, "goals_y: as many as goals_x", goals_y);
   auto found_x = zeros<double>(count), found_y = zeros<double>(count);
@@ -81,41 +82,12 @@ auto undistort(const Array<double, 8>& coefficients, const Reals& goals_x, const
         y = y + (a * (goals_y(n) - dy) - c * (goals_x(n) - dx)) / determinant;
         if (x == before_x && y == before_y) break;  // a further step would be the same
       }
-      found_x[n] = x, found_y[n] = y;
+      const auto [back_x, back_y] = distorted(lens, x, y);
+      const bool is_found = std::hypot(back_x - goals_x(n), back_y - goals_y(n)) < kMissed && x * x + y * y < reach;
+      found_x[n] = is_found ? x : std::nan(""), found_y[n] = is_found ? y : std::nan("");
     }
   });
   return std::tuple(std::move(found_x), std::move(found_y));
-}
-
-// Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 at which the image of
-// radial-tangential distortion does not fold back yet.
-struct LensCamera {
-  double fx, fy, cx, cy, reach;
-  ptrdiff_t width, height;
-};
-
-// Fills colour, an image of the camera that comes as zeros, with the depth of the nearest point at each of its pixels. The points are
-// depth (count) along rays (count, 3), which have z = 1 and are NaN for pixels without one. All four pixels around a point take it: with
-// the nearest alone the background would shine through the foreground.
-template <typename Lens>
-void fill_nearest(const float* depth, const double* rays, size_t count, const SE3& colour_from_depth, const LensCamera& camera,
-                  const Lens& lens, float* colour) {
-  const auto [fx, fy, cx, cy, reach, width, height] = camera;
-  for (size_t n = 0; n < count; ++n) {
-    if (!(depth[n] > 0.0f)) continue;
-    const Vec3 point = colour_from_depth * (double(depth[n]) * vec3(rays + 3 * n));
-    double image[2];
-    if (!(point[2] > kNearest && is_seen(lens, reach, point, image))) continue;
-    const double u = fx * image[0] + cx, v = fy * image[1] + cy;
-    if (!(-1.0 <= u && u < double(width) && -1.0 <= v && v < double(height))) continue;
-    const ptrdiff_t left = ptrdiff_t(std::floor(u)), top = ptrdiff_t(std::floor(v));
-    for (ptrdiff_t row = std::max<ptrdiff_t>(top, 0); row < std::min(top + 2, height); ++row)
-      for (ptrdiff_t column = std::max<ptrdiff_t>(left, 0); column < std::min(left + 2, width); ++column) {
-        float& held = colour[row * width + column];
-        const float found = float(point[2]);
-        if (held == 0.0f || found < held) held = found;
-      }
-  }
 }
 
 // Calls use with the lens that these coefficients say.
@@ -148,16 +120,36 @@ auto pixels_of_rays(const Points& rays, const Array<double, 4>& intrinsics, cons
   return as_numpy<double, 2>(std::move(pixels), {count, 2});
 }
 
+// A depth image of a camera with a lens, u = fx x' + cx, v = fy y' + cy of the distorted x', y': the nearest point at each of its pixels,
+// 0 without one. The points are depth along rays, which have z = 1 and are NaN for pixels without one. All four pixels around a point take
+// it: with the nearest alone the background would shine through the foreground. reach: largest x^2 + y^2 at which the image of
+// radial-tangential distortion does not fold back yet.
 auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const SE3& colour_from_depth, const Array<double, 4>& intrinsics,
                     const Reals& lens, double reach, int width, int height) {
   constexpr int64_t kMostPixels = 1 << 26;
   const size_t count = depth.size();
   check_rows(count, "rays: one for each pixel of depth", rays);
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
-  const LensCamera camera{intrinsics(0), intrinsics(1), intrinsics(2), intrinsics(3), reach, width, height};
   auto colour = zeros<float>(size_t(width) * size_t(height));
   with_lens(lens, [&](const auto& coefficients) {
-    unlocked([&] { fill_nearest(depth.data(), rays.data(), count, colour_from_depth, camera, coefficients, colour.data()); });
+    unlocked([&] {
+      for (size_t n = 0; n < count; ++n) {
+        const float away_m = depth.data()[n];
+        if (!(away_m > 0.0f)) continue;
+        const Vec3 point = colour_from_depth * (double(away_m) * rays.rows()[n]);
+        double image[2];
+        if (!(point[2] > kNearest && is_seen(coefficients, reach, point, image))) continue;
+        const double u = intrinsics(0) * image[0] + intrinsics(2), v = intrinsics(1) * image[1] + intrinsics(3);
+        if (!(-1.0 <= u && u < double(width) && -1.0 <= v && v < double(height))) continue;
+        const int left = int(std::floor(u)), top = int(std::floor(v));
+        for (int row = std::max(top, 0); row < std::min(top + 2, height); ++row)
+          for (int column = std::max(left, 0); column < std::min(left + 2, width); ++column) {
+            float& held = colour[size_t(row) * size_t(width) + size_t(column)];
+            const float found = float(point[2]);
+            if (held == 0.0f || found < held) held = found;
+          }
+      }
+    });
   });
   return as_numpy<float, 2>(std::move(colour), {size_t(height), size_t(width)});
 }
@@ -166,7 +158,7 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
 
 void bind_camera(nb::module_& module) {
   module.def("pixels_of_rays", &pixels_of_rays, "rays"_a, "intrinsics"_a, "lens"_a, "reach"_a);
-  module.def("undistort", &undistort, "lens"_a, "goals_x"_a, "goals_y"_a);
+  module.def("undistort", &undistort, "lens"_a, "reach"_a, "goals_x"_a, "goals_y"_a);
   module.def("register_depth", &register_depth, "depth"_a, "rays"_a, "colour_from_depth"_a, "intrinsics"_a, "lens"_a, "reach"_a, "width"_a,
              "height"_a);
 }

@@ -485,29 +485,20 @@ class ScenePainter {
       for (ptrdiff_t x = 0; x < columns_; ++x) {
         // The polygons of the pixel's samples: number of samples of each, and the sums of their positions.
         int32_t seen[kMostSamples];
-        int hits[kMostSamples], count = 1;
-        double sum_x[kMostSamples], sum_y[kMostSamples];
+        int hits[kMostSamples], sum_x[kMostSamples], sum_y[kMostSamples], count = 0;
         const int32_t* const corner = owner + (y * columns_ * samples + x) * samples;
-        const auto at = [&](int i, int j) { return corner[i * columns_ * samples + j]; };
-        seen[0] = at(0, 0), hits[0] = samples * samples, sum_x[0] = sum_y[0] = 0.5 * (samples - 1) * hits[0];
-        bool is_uniform = true;
         for (int i = 0; i < samples; ++i)
-          for (int j = 0; j < samples; ++j) is_uniform &= at(i, j) == seen[0];
-        if (!is_uniform) {
-          count = 0;
-          for (int i = 0; i < samples; ++i)
-            for (int j = 0; j < samples; ++j) {
-              int n = 0;
-              while (n < count && seen[n] != at(i, j)) ++n;
-              if (n == count) seen[n] = at(i, j), hits[n] = 0, sum_x[n] = sum_y[n] = 0.0, ++count;
-              ++hits[n], sum_x[n] += j, sum_y[n] += i;
-            }
-        }
+          for (int j = 0; j < samples; ++j) {
+            const int32_t polygon = corner[i * columns_ * samples + j];
+            const int n = int(std::find(seen, seen + count, polygon) - seen);
+            if (n == count) seen[n] = polygon, hits[n] = sum_x[n] = sum_y[n] = 0, ++count;
+            ++hits[n], sum_x[n] += j, sum_y[n] += i;
+          }
         double total = 0.0;
         for (int n = 0; n < count; ++n) {
           if (seen[n] < 0) continue;
           const Polygon& polygon = direct_.polygons[size_t(seen[n])];
-          const double off_x = (sum_x[n] / hits[n] + 0.5) * step - 0.5, off_y = (sum_y[n] / hits[n] + 0.5) * step - 0.5;
+          const double off_x = (double(sum_x[n]) / hits[n] + 0.5) * step - 0.5, off_y = (double(sum_y[n]) / hits[n] + 0.5) * step - 0.5;
           double xn, yn;
           if (rays_.empty()) {
             xn = (double(x) + off_x + instant.shift_x - plane_.cx) * per_px_x;

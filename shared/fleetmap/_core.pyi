@@ -249,8 +249,8 @@ def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
 def pixels_of_rays(rays: _Reals, intrinsics: _Reals, lens: _Reals, reach: float) -> _Reals:
     """(N, 2) pixels of rays (N, 3), NaN without one; the camera as in `register_depth`."""
 
-def undistort(lens: _Reals, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
-    """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 maps to the goals; not checked."""
+def undistort(lens: _Reals, reach: float, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
+    """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 maps to the goals; NaN beyond x^2 + y^2 = reach."""
 
 def register_depth(
     depth: _Floats,

@@ -61,15 +61,10 @@ class RadialTangential(CameraModel):
     def ray_from_pixel(self, intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
         """Newton's method with a numeric Jacobian; NaN if it does not converge to the pixel."""
         fx, fy, cx, cy = intrinsics_px
-        lens = _coefficients(distortion)
-        goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-        x, y = core.undistort(np.array(lens), goal_x, goal_y)
+        goals = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+        x, y = core.undistort(*self.core_lens(distortion), *goals)
         rays = np.stack([x, y, np.ones_like(x)], axis=1)
-        back = core.pixels_of_rays(rays, np.array([1.0, 1.0, 0.0, 0.0]), np.array(lens), _radial_limit(lens))
-        missed = ~(np.hypot(back[:, 0] - goal_x, back[:, 1] - goal_y) < 1e-7)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        rays[missed] = np.nan
-        return np.asarray(rays)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def core_lens(self, distortion: Array) -> tuple[Array, float]:
         lens = _coefficients(distortion)
