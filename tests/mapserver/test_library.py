@@ -68,9 +68,9 @@ def test_a_name_that_it_does_not_have() -> None:
 
 
 def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:
-    """As with `fleetmap[client]`: gtsam is not there."""
-    script = "import sys; sys.modules['gtsam'] = None; from mapserver import build_map"
+    """As with `fleetmap[client]`: scipy is not there."""
+    script = "import sys; sys.modules['scipy'] = None; from mapserver import build_map"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith("fleetmap.errors.FleetmapError: mapserver.build_map needs gtsam")
+    assert done.stderr.splitlines()[-1].startswith("fleetmap.errors.FleetmapError: mapserver.build_map needs scipy")
     assert "pip install '.[server]'" in done.stderr
