@@ -17,7 +17,7 @@ from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from mapserver.store import files
 from mapserver.store.rows import NOBODY, UNLIMITED, Actor, AuditLine
-from mapserver.store.schema import FIRST_FORMAT, FORMAT, MIGRATIONS, TABLES, names
+from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES, names
 
 APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
 NUL = r"\x00"
@@ -392,9 +392,13 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> int:
 
 def _migrate(connection: sqlite3.Connection) -> None:
     """Run the pending migrations: another process may have run some."""
-    (number,) = connection.execute("PRAGMA user_version").fetchone()
-    for migration in MIGRATIONS[max(0, number - FIRST_FORMAT) :]:
-        migration(connection)
+    # Here, since few starts migrate, and it imports pandas where that is installed.
+    from sqlite_utils import Database, Migrations
+
+    named = Migrations("fleetmap")
+    for migration in MIGRATIONS:
+        named()(migration)
+    named.apply(Database(connection, execute_plugins=False))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {FORMAT}")
 

@@ -1,13 +1,12 @@
 """The tables of the database, most with a column for each field of a record in `rows`.
 
-A change is a further migration; a released one is never changed.
+A change is a further migration, known by its name; a released one is never changed.
 """
 
 from collections.abc import Callable
 from dataclasses import fields
-from sqlite3 import Connection
 from types import NoneType
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.store.rows import (
@@ -20,6 +19,9 @@ from mapserver.store.rows import (
     TraceRow,
     VersionInfo,
 )
+
+if TYPE_CHECKING:
+    from sqlite_utils import Database
 
 _OF_VERSION = "FOREIGN KEY (site, version) REFERENCES versions(site, version)"
 _TYPES = {int: "INTEGER", bool: "INTEGER", str: "TEXT", float: "REAL", bytes: "BLOB"}
@@ -114,23 +116,22 @@ def statements(compact: str = " WITHOUT ROWID") -> list[str]:
     return made + INDEXES
 
 
-def _make_tables(connection: Connection) -> None:
+def tables(database: "Database") -> None:
     """Create the first schema."""
     for statement in statements():
-        connection.execute(statement)
+        database.execute(statement)
     for name, change, words in (
         ("events_are_kept", "DELETE", "shortened"),
         ("events_stay_as_they_are", "UPDATE", "changed"),
     ):
-        connection.execute(
+        database.execute(
             f"""CREATE TRIGGER {name} BEFORE {change} ON events
                 BEGIN SELECT RAISE(ABORT, 'the log of events is never {words}'); END"""
         )
 
 
-MIGRATIONS: list[Callable[[Connection], None]] = [_make_tables]
-FIRST_FORMAT = 12  # before the first migration
-FORMAT = FIRST_FORMAT + len(MIGRATIONS)
+MIGRATIONS: list[Callable[["Database"], None]] = [tables]
+FORMAT = 12 + len(MIGRATIONS)  # there were 12 before migrations had names
 """SQLite's user_version of a database with all migrations: reveals an older database by its header, and is newer for older programs."""
 
 

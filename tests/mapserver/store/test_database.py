@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from sqlite_utils import Database
 
 from fleetmap.errors import StoreError
 from mapserver.store import MapStore, map_store, schema
@@ -67,16 +68,24 @@ def test_closing_leaves_one_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["store.sqlite3"]
 
 
+def test_a_store_of_the_first_day_with_named_migrations_opens(tmp_path: Path) -> None:
+    MapStore.open(tmp_path, create=True).close()
+    with closing(sqlite3.connect(tmp_path / "store.sqlite3")) as connection:
+        connection.execute("PRAGMA user_version = 13")
+    with MapStore.open(tmp_path) as store:
+        assert store.sites() == []
+
+
 def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
 
-    def add_wings(connection: sqlite3.Connection) -> None:
-        connection.execute("ALTER TABLE sites ADD COLUMN wing TEXT")
+    def wings(database: Database) -> None:
+        database.execute("ALTER TABLE sites ADD COLUMN wing TEXT")
 
-    monkeypatch.setattr(database_module, "MIGRATIONS", [*schema.MIGRATIONS, add_wings])
+    monkeypatch.setattr(database_module, "MIGRATIONS", [*schema.MIGRATIONS, wings])
     for module in (database_module, map_store):
         monkeypatch.setattr(module, "FORMAT", FORMAT + 1)
     path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{FORMAT}.sqlite3"
@@ -102,6 +111,8 @@ def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
     copied = copy.read_bytes()
     with MapStore.open(tmp_path) as store:
         assert [info.version for info in store.versions("lab")] == [1]
+        applied = store._database.column("SELECT name FROM _sqlite_migrations ORDER BY rowid")
+    assert applied == ["tables", "wings"]
     assert copy.read_bytes() == copied, "once"
 
 
