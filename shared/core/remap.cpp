@@ -91,7 +91,7 @@ class Remap {
       }
   }
 
-  auto operator()(const Image& image) const {
+  auto resample(const Image& image) const {
     if (ptrdiff_t(image.shape(0)) != height_ || ptrdiff_t(image.shape(1)) != width_)
       throw nb::value_error("image: of the size that the tables are for");
     auto made = unlocked([&] {
@@ -154,10 +154,10 @@ void bind_remap(nb::module_& module) {
           "__init__",
           [](Remap* remap, const Array<int16_t, -1, -1, 2>& pixels, const Array<uint16_t, -1, -1>& shares, size_t height, size_t width) {
             if (!same_size(pixels, shares)) throw nb::value_error("shares: one for each of pixels");
-            new (remap) Remap(pixels, shares, ptrdiff_t(height), ptrdiff_t(width));
+            unlocked([&] { new (remap) Remap(pixels, shares, ptrdiff_t(height), ptrdiff_t(width)); });
           },
           "pixels"_a, "shares"_a, "height"_a, "width"_a)
-      .def("__call__", &Remap::operator(), "image"_a);
+      .def("resample", &Remap::resample, "image"_a);
 }
 
 }  // namespace fleetmap

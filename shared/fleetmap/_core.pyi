@@ -238,7 +238,7 @@ class Remap:
 
     def __init__(self, pixels: NDArray[np.int16], shares: NDArray[np.uint16], height: int, width: int) -> None:
         """pixels (H, W, 2), shares (H, W): of the result; height, width: of the images."""
-    def __call__(self, image: _Grey) -> _Grey: ...
+    def resample(self, image: _Grey) -> _Grey: ...
 
 def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
     """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""

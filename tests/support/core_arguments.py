@@ -54,7 +54,10 @@ class Arguments:
 
     def array(self, dtype: str, sides: str) -> Array:
         size = self.size + self.name.endswith("starts")
-        lengths = [int(self.rng.choice([*SIZES, size + 1])) if self.is_odd() else size for _ in range(3)]
+        lengths = [
+            int(self.rng.choice([*SIZES, size + 1])) if self.is_odd() else size
+            for _ in range(max(3, sides.count(",") + 1))
+        ]
         if self.rng.random() < 0.1 * self.malice:
             lengths[0] = 3000
         shape = [lengths[axis] if side == "*" else int(side) for axis, side in enumerate(sides.split(", "))]
@@ -79,7 +82,7 @@ class Arguments:
 
     def rows(self) -> Callable[..., tuple[Array, ...]]:
         """Image rows of a bundle adjustment."""
-        answer = tuple(self.array("float64", sides) for sides in ("*, 4", "*, 4, 3", "*, 4, *", "*, 3"))
+        answer = tuple(self.array("float64", sides) for sides in ("*, 4", "*, 4, 3", "*, 4, *", "*, 3", "4"))
         return lambda *_: answer
 
     def of(self, function: object) -> list[object]:
@@ -150,6 +153,8 @@ GIVEN: dict[str, Callable[[Any], tuple[object, ...]]] = {
         *(FixSettings(), StereoSettings(), 0.35, REFINEMENT),
     ),
     "FixFinder.by_projection": lambda _: ((np.ones((5, 3)), np.ones((5, 2)), np.zeros(5, np.int8), WORDS), None, np.eye(4), 9.0),
+    "Remap": lambda _: (np.zeros((8, 8, 2), np.int16), np.zeros((8, 8), np.uint16), 4, 9),
+    "Remap.resample": lambda _: (np.zeros((4, 9), np.uint8),),
     "ScenePainter": lambda _: (np.full(6, 4.0), np.zeros((0, 0, 4), np.float32)),
     "ScenePainter.add": lambda _: (
         *((QUADS, SIXES, FACES, SINGLES[0], np.ones(1)), (FACES[:, :2].copy(), SIXES), TEXTURES, np.eye(3), np.zeros(3)),

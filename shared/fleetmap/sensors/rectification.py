@@ -239,7 +239,7 @@ class Rectifier:
                 "pass the matching one with --calibration FILE"
             )
         tables = self._maps[index]
-        return image if tables is None else tables[0](np.ascontiguousarray(image))
+        return image if tables is None else tables[0].resample(np.ascontiguousarray(image))
 
 
 def _rectifying_rotation(

@@ -81,7 +81,7 @@ def test_pictures_are_resampled_as_opencv_does(size_px: tuple[int, int], bend_px
     tables = cv2.convertMaps(*(each.astype(np.float32) for each in at), cv2.CV_16SC2)
     height, width = size_px[0] - 1, size_px[1] + 3
     picture = rng.integers(0, 256, (height, width)).astype(np.uint8)
-    made = core.Remap(*tables, height, width)(picture)  # type: ignore[arg-type]
+    made = core.Remap(*tables, height, width).resample(picture)  # type: ignore[arg-type]
     np.testing.assert_array_equal(made, cv2.remap(picture, *tables, cv2.INTER_LINEAR))
 
 
