@@ -178,16 +178,19 @@ def run_checks(
     findings += [*calibration.findings, images.sharpness([look.variance for look in seen.looks])]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
-        repeats, count = frames.repeats, min(TURN_FRAMES, len(recording))
-        bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
-        limits = Limits(0.02, 0.1, "of the frames")
-        findings.append(judge("repeated images", repeats / count, limits, "every frame has an image of its own", bad))
+        findings.append(_repeated(frames.repeats, min(TURN_FRAMES, len(recording))))
     known = {}
     if seen.wheels is not None and seen.wheels.size:
         known["the wheels"] = seen.wheels.size, seen.wheels.speed_sigma
     if given is not None and given.metres > 0:
         known["the accelerometer"] = given.metres, given.sigma
     return CheckResults(findings + sensors.other_issues(recording.issues), gyro_fit, calibration, known)
+
+
+def _repeated(repeats: int, count: int) -> Finding:
+    bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
+    limits = Limits(0.02, 0.1, "of the frames")
+    return judge("repeated images", repeats / count, limits, "every frame has an image of its own", bad)
 
 
 class _ByTurns(NamedTuple):

@@ -5,9 +5,6 @@ Source: Portable Network Graphics (PNG) Specification, third edition.
 
 import struct
 from collections.abc import Iterator
-from importlib import import_module
-from importlib.util import find_spec
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +13,11 @@ from fleetmap import core
 from fleetmap.geometry import AnyArray
 from fleetmap.recordings.limits import MAX_PIXELS
 
-# isal has wheels for x86-64 and 64-bit ARM; elsewhere Python's own does the same, more slowly.
-_zlib: Any = import_module("isal.isal_zlib" if find_spec("isal") else "zlib")
+try:  # it has wheels for x86-64 and 64-bit ARM; elsewhere Python's own does the same, more slowly
+    from isal import isal_zlib as _zlib
+except ImportError:
+    import zlib as _zlib  # type: ignore[no-redef]
+
 PNG_START = b"\x89PNG\r\n\x1a\n"
 _PIXEL_BYTES = {(8, 0): 1, (16, 0): 2, (8, 2): 3}  # by bits and kind of colour: grey, and red, green and blue
 _HEAD = struct.Struct(">IIBBBBB")
@@ -64,7 +64,7 @@ def plain_png_pixels(data: bytes) -> AnyArray | None:
             return None
         filtered = np.frombuffer(inflating.decompress(packed, height * row_bytes + 1), np.uint8)
         rows = core.png_rows(filtered.reshape(height, row_bytes), pixel_bytes)
-    except (struct.error, KeyError, ValueError, _zlib.error):
+    except (struct.error, KeyError, ValueError, _zlib.error):  # type: ignore[misc]
         return None
     if not inflating.eof:
         return None
