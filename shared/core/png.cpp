@@ -47,7 +47,7 @@ void decode_rows(GreyImage from, uint8_t* to) {
 
 auto png_rows(const Image& filtered, int pixel_bytes) {
   const size_t height = filtered.shape(0), width = filtered.shape(1);
-  if (filtered.size() == 0 || pixel_bytes < 1 || pixel_bytes > 3 || (width - 1) % size_t(pixel_bytes) != 0)
+  if (height == 0 || width < 2 || pixel_bytes < 1 || pixel_bytes > 3 || (width - 1) % size_t(pixel_bytes) != 0)
     throw nb::value_error("pixel_bytes: 1 to 3, and whole pixels in each row of filtered");
   for (size_t y = 0; y < height; ++y)
     if (filtered.data()[y * width] > 4) throw nb::value_error("filtered: each row begins with 0 to 4");

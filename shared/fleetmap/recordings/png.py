@@ -52,21 +52,28 @@ def plain_png_pixels(data: bytes) -> AnyArray | None:
 
     None for a file that is damaged, large, or of another kind, such as interlaced ones and those with a palette: let OpenCV judge it.
     """
-    chunks = list(_chunks(data)) if data.startswith(PNG_START) else []
-    if not chunks or not {kind for kind, _ in chunks} <= _PLAIN:
+    head, packed, last, is_behind = None, bytearray(), b"", False
+    for kind, content in _chunks(data) if data.startswith(PNG_START) else ():
+        if kind not in _PLAIN or (kind == b"IHDR") != (head is None) or (kind == b"IDAT" and is_behind):
+            return None
+        head = content if head is None else head
+        packed += content if kind == b"IDAT" else b""
+        is_behind |= last == b"IDAT" != kind
+        last = kind
+    if head is None or last != b"IEND":
         return None
-    inflating, packed = _zlib.decompressobj(), b"".join(content for kind, content in chunks if kind == b"IDAT")
+    inflating = _zlib.decompressobj()
     try:
-        width, height, bits, colour, *others = _HEAD.unpack(chunks[0][1])
+        width, height, bits, colour, *others = _HEAD.unpack(head)
         pixel_bytes = _PIXEL_BYTES[bits, colour]
         row_bytes = 1 + width * pixel_bytes
-        if any(others) or width * height > MAX_PIXELS:
+        if any(others) or not 0 < width * height <= MAX_PIXELS:
             return None
         filtered = np.frombuffer(inflating.decompress(packed, height * row_bytes + 1), np.uint8)
         rows = core.png_rows(filtered.reshape(height, row_bytes), pixel_bytes)
     except (struct.error, KeyError, ValueError, _zlib.error):  # type: ignore[misc]
         return None
-    if not inflating.eof:
+    if not inflating.eof or inflating.unused_data:
         return None
     if bits == 16:
         return rows.view(">u2").astype(np.uint16)

@@ -34,7 +34,7 @@ from mapserver.config import MapserverConfig
 from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import foreign_messages, write_foreign
-from support.recordings.recording_samples import png_of
+from support.recordings.recording_samples import grey_png
 from support.storage.memory_limit import memory_at_most
 
 BOMB_BYTES = 256 << 20
@@ -298,7 +298,7 @@ def test_the_header_says_what_opencv_decodes(suffix: str, width: int, height: in
 def test_a_picture_of_3600_megapixels_is_not_decoded(suffix: str) -> None:
     data = bytearray(encoded(suffix, 321, 123))
     if suffix == ".png":
-        data = bytearray(png_of(zlib.compress(bytes(100_000), 1), 60_000, 60_000))
+        data = bytearray(grey_png(zlib.compress(bytes(100_000), 1), 60_000, 60_000))
     elif suffix == ".jpg":
         at = data.index(b"\xff\xc0") + 5
         data[at : at + 4] = struct.pack(">HH", 60_000, 60_000)

@@ -19,7 +19,7 @@ from fleetmap.recordings.images import INVERSE_DEPTH, RAW_ENCODINGS, StoredImage
 from fleetmap.recordings.png import plain_png_pixels
 from fleetmap.recordings.ros2 import messages as ros_messages
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
-from support.recordings.recording_samples import HEIGHT, WIDTH, make_sample, png_of, write_euroc
+from support.recordings.recording_samples import HEIGHT, WIDTH, grey_png, make_sample, png_of, write_euroc
 
 NOISE = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)
 PNG, JPEG = (bytes(cv2.imencode(kind, NOISE)[1]) for kind in (".png", ".jpg"))
@@ -44,10 +44,10 @@ ROWS = b"".join(b"\0" + bytes(row) for row in NOISE)
         flipped(PNG),
         without_middle(PNG),
         without_middle(JPEG),
-        png_of(zlib.compress(ROWS[:1000]), 80, 60),
-        png_of(zlib.compress(ROWS)[:-4] + b"abcd", 80, 60),
-        png_of(zlib.compress(b"\x09" * len(ROWS)), 80, 60),
-        png_of(b"", 80, 60),
+        grey_png(zlib.compress(ROWS[:1000]), 80, 60),
+        grey_png(zlib.compress(ROWS)[:-4] + b"abcd", 80, 60),
+        grey_png(zlib.compress(b"\x09" * len(ROWS)), 80, 60),
+        grey_png(b"", 80, 60),
         PNG[:100],
         b"",
     ],
@@ -85,9 +85,39 @@ def test_pngs_of_other_kinds_and_any_flipped_byte_are_left_to_opencv() -> None:
         assert plain_png_pixels(other.getvalue()) is None
     data = small.getvalue()
     assert plain_png_pixels(data) is not None
-    assert plain_png_pixels(png_of(zlib.compress(ROWS + b"\0"), 80, 60)) is None
+    assert plain_png_pixels(grey_png(zlib.compress(ROWS + b"\0"), 80, 60)) is None
     for at in range(len(data)):
         assert plain_png_pixels(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]) is None, at
+
+
+HEAD, PIXELS, END = (
+    (b"IHDR", struct.pack(">IIBBBBB", 9, 9, 8, 0, 0, 0, 0)),
+    (b"IDAT", zlib.compress(bytes(90))),
+    (b"IEND", b""),
+)
+
+
+def no_columns(*kind: int) -> tuple[tuple[bytes, bytes], ...]:
+    return (b"IHDR", struct.pack(">IIBBBBB", 0, 9, *kind, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(9))), END
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        *(
+            no_columns(8, 0),
+            no_columns(16, 0),
+            no_columns(8, 2),
+            (HEAD, HEAD, PIXELS, END),
+            ((b"tEXt", HEAD[1]), PIXELS, END),
+        ),
+        *((HEAD, PIXELS), (HEAD, (b"IDAT", PIXELS[1] + b"more"), END)),
+        (HEAD, (b"IDAT", PIXELS[1][:9]), (b"tEXt", b"a\0b"), (b"IDAT", PIXELS[1][9:]), END),
+    ],
+)
+def test_what_is_no_png_is_left_to_opencv(chunks: tuple[tuple[bytes, bytes], ...]) -> None:
+    assert plain_png_pixels(png_of(HEAD, (b"IDAT", PIXELS[1][:9]), (b"IDAT", PIXELS[1][9:]), END)) is not None
+    assert plain_png_pixels(png_of(*chunks)) is None
 
 
 def test_packed_depth_too(capfd: pytest.CaptureFixture[str]) -> None:

@@ -242,14 +242,17 @@ def write_video(path: Path, images: Sequence[NDArray[np.uint8]], times_ms: Seque
     return path
 
 
-def png_of(stream: bytes, width: int, height: int) -> bytes:
-    """A PNG whose checksums are right, whatever its stream of pixels is."""
+def png_of(*chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG of chunks, each a kind and its content, whose checksums are right."""
+    made = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(made)
 
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", stream) + chunk(b"IEND", b"")
+def grey_png(stream: bytes, width: int, height: int) -> bytes:
+    """A PNG of 8 bits, whatever its stream of pixels is."""
+    return png_of((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", stream), (b"IEND", b""))
 
 
 def _euroc_yaml(camera: CameraCalibration, yaml_line: bool) -> str:
