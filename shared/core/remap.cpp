@@ -5,15 +5,16 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
-#else
+#elif defined(__aarch64__)
 #include <arm_neon.h>
 #endif
 
 namespace fleetmap {
 namespace {
 
-constexpr ptrdiff_t kBlock = 8;                             // pixels of a row that are made at once
-constexpr ptrdiff_t kReach = 16;                            // pixels of a row of the source in one register
+constexpr ptrdiff_t kBlock = 8;   // pixels of a row that are made at once
+constexpr ptrdiff_t kReach = 16;  // pixels of a row of the source in one register
+constexpr size_t kMostPixels = std::numeric_limits<int32_t>::max();
 constexpr uint32_t kShares = 32, kAll = kShares * kShares;  // into which a pixel is divided along a row, and as a whole
 
 using Bytes [[gnu::vector_size(kReach)]] = uint8_t;
@@ -25,7 +26,7 @@ inline Bytes chosen(Bytes from, Bytes numbers) { return Bytes(_mm_shuffle_epi8(_
 inline Bytes interleaved(Bytes a, Bytes b) { return Bytes(_mm_unpacklo_epi8(__m128i(a), __m128i(b))); }
 inline Words sums_of_pairs(Bytes a, Bytes b) { return Words(_mm_maddubs_epi16(__m128i(a), __m128i(b))); }
 inline Words high_product(Words a, Words b) { return Words(_mm_mulhi_epi16(__m128i(a), __m128i(b))); }
-#else
+#elif defined(__aarch64__)
 inline Bytes chosen(Bytes from, Bytes numbers) { return Bytes(vqtbl1q_u8(uint8x16_t(from), uint8x16_t(numbers))); }
 inline Bytes interleaved(Bytes a, Bytes b) { return Bytes(vzip1q_u8(uint8x16_t(a), uint8x16_t(b))); }
 inline Words sums_of_pairs(Bytes a, Bytes b) {
@@ -82,7 +83,7 @@ class Remap {
         Place places[kBlock];
         for (ptrdiff_t k = 0; k < count; ++k) {
           const int16_t* const pixel = pixels.data() + 2 * (first + k);
-          const uint32_t share = shares.data()[first + k];
+          const uint32_t share = shares.data()[first + k] & (kAll - 1);
           places[k] = {pixel[0], pixel[1], uint8_t(share % kShares), uint8_t(share / kShares)};
         }
         blocks_.push_back(count == kBlock ? block_of(places) : Block{});
@@ -154,6 +155,7 @@ void bind_remap(nb::module_& module) {
           "__init__",
           [](Remap* remap, const Array<int16_t, -1, -1, 2>& pixels, const Array<uint16_t, -1, -1>& shares, size_t height, size_t width) {
             if (!same_size(pixels, shares)) throw nb::value_error("shares: one for each of pixels");
+            if (std::max(height, width) > kMostPixels) throw nb::value_error("height, width: below 2^31");
             unlocked([&] { new (remap) Remap(pixels, shares, ptrdiff_t(height), ptrdiff_t(width)); });
           },
           "pixels"_a, "shares"_a, "height"_a, "width"_a)

@@ -214,6 +214,7 @@ class Rectifier:
         right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
         disparity = None
         if self.has_depth and frame.depth_m is not None:
+            self._check_size(frame.depth_m.shape, 0, frame.stamp_ns, "depth image")
             depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
             disparity = (self.camera.focal_px * self.camera.baseline_m / depth).astype(np.float32)
             if self._maps[0] is not None:
@@ -231,13 +232,16 @@ class Rectifier:
         later_ns = round((rectifier.imu_minus_cam_s - self.imu_minus_cam_s) * 1e9)
         return OtherView(replace(frame, stamp_ns=frame.stamp_ns + later_ns), rectifier)
 
-    def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
-        if image.shape != self._sizes[index]:
-            (height, width), (rows, columns) = self._sizes[index], image.shape
+    def _check_size(self, found: tuple[int, ...], index: int, stamp_ns: int, kind: str = "image") -> None:
+        if found != self._sizes[index]:
+            (height, width), (rows, columns) = self._sizes[index], found
             raise RecordingError(
-                f"cam{self._numbers[index]} image at {stamp_ns} is {columns}x{rows}, the calibration says {width}x{height}; "
+                f"cam{self._numbers[index]} {kind} at {stamp_ns} is {columns}x{rows}, the calibration says {width}x{height}; "
                 "pass the matching one with --calibration FILE"
             )
+
+    def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
+        self._check_size(image.shape, index, stamp_ns)
         tables = self._maps[index]
         return image if tables is None else tables[0].resample(np.ascontiguousarray(image))
 
