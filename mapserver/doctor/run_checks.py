@@ -150,7 +150,7 @@ def run_checks(
     by_turns, data = None, None
     is_sound = not any(f.verdict is Verdict.FAIL for f in (*stamps, *soon))
     if has_pair and len(imu) and is_sound and followed_frames(recording):
-        by_turns, data = _by_odometry(frames, soon, follow)
+        by_turns, data = _by_odometry(frames, soon, follow, seen)
     if by_turns is None:
         pairs = frames.consecutive(TURN_FRAMES)
         by_turns = _by_turns(recording, CameraTurns.of(executor.map(body_motion, frames.rig, pairs)), soon)
@@ -219,7 +219,7 @@ class _Doubt(Exception):  # noqa: N818 -- no error: what it ends is done otherwi
 
 
 def _by_odometry(
-    frames: _Frames, soon: Sequence[Finding], follow: Follow
+    frames: _Frames, soon: Sequence[Finding], follow: Follow, sampled: "_Seen"
 ) -> tuple[_ByTurns | None, CalibrationData | None]:
     """Return the findings by the turns that the odometry of the drive sees, and its data; None as far as they are not certain.
 
@@ -235,12 +235,16 @@ def _by_odometry(
 
     try:
         data = follow(recording, recording.calibration, watch)
-    except (RecordingError, SurveyError, _Doubt):
+    except (RecordingError, SurveyError, np.linalg.LinAlgError, _Doubt):
         return None, None
     turns = CameraTurns.of(seen.motions)
     is_whole = not seen.repeats and len(turns.starts_ns) > _CERTAIN_SHARE * len(seen.motions)
     found = _by_turns(recording, turns, soon) if is_whole else None
-    return found if found is not None and found.verdict is Verdict.OK else None, data
+    if found is None or found.verdict is not Verdict.OK:
+        return None, data
+    # The fit of a metre is biased by noise of the images, and over a whole drive surer than that: it certifies, but refuses nothing.
+    _, metres = judge_metres(sampled.wheels, found.given, sampled.images, has_imu=True)
+    return found if metres.verdict in (Verdict.OK, Verdict.NOT_JUDGED) else None, data
 
 
 def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Finding]) -> tuple[Finding, AxesFit | None]:

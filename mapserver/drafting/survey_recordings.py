@@ -240,7 +240,7 @@ class BegunSurvey:
     ) -> None:
         """whole: with all cameras of its rig, of which the calibration concerns the first. indices (F,): of the selected frames."""
         self._whole, self._indices, self._settings, self._tools = whole, indices, settings, tools
-        self._made: tuple[RigCalibration, AdjustedChain] | None = None
+        self._made: tuple[RigCalibration, bool, AdjustedChain] | None = None
 
     def __call__(self, recording: Recording, rig: RigCalibration, watch: Watch) -> CalibrationData:
         """Return the data of the frames under the calibration `rig`. SurveyError if they are too few to be tracked."""
@@ -255,20 +255,22 @@ class BegunSurvey:
             chain = begin_survey(inputs, self._settings, replace(self._tools, images=images, watch=watch))
             self._tools.at("local adjustment", 1, 1)
             if is_believed:
-                self._made = rig, chain
+                self._made = rig, len(recording.wheel) > 0, chain
             return busiest_stretch(chain, (rig, rectifier), recording.wheel)
 
-    def chain_of(self, rig: RigCalibration) -> AdjustedChain | None:
-        """Return the result under a calibration; None if the last one used was another."""
-        return self._made[1] if self._made is not None and self._made[0] is rig else None
+    def chain_of(self, rig: RigCalibration, *, has_wheels: bool) -> AdjustedChain | None:
+        """Return the result under a calibration, with the wheels or without; None if the last one used was another."""
+        if self._made is None or self._made[0] is not rig or self._made[1] != has_wheels:
+            return None
+        return self._made[2]
 
     @staticmethod
-    def suits(recording: Recording, indices: NDArray[np.int64]) -> bool:
-        """True if the selected frames are consecutive, and as informative as any stretch."""
+    def suits(recording: Recording, indices: NDArray[np.int64], *, is_only: bool = True) -> bool:
+        """True if the selected frames are consecutive, and as informative as any stretch; and not many, where other drives wait as long."""
         stamps_ns = recording.frame_stamps_ns[indices]
         seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
         is_run, is_enough = len(indices) == np.ptp(indices) + 1, len(indices) == len(recording) or seconds >= LONGEST_S
-        return bool(is_run and is_enough)
+        return bool(is_run and is_enough and (is_only or seconds <= _TRIED_S))
 
 
 def admit_recordings(
@@ -291,7 +293,9 @@ def admit_recordings(
     for path in paths:
         look_at([path])
         with _noting(path, unusable):
-            admitted[path] = _admission(path, reading, console, needs_truth, settings, tools or SurveyTools())
+            admitted[path] = _admission(
+                path, reading, console, needs_truth, settings, tools or SurveyTools(), is_only=len(paths) == 1
+            )
     if not admitted:
         raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
@@ -322,6 +326,8 @@ def _admission(
     needs_truth: bool,
     settings: SurveySettings | None,
     tools: SurveyTools,
+    *,
+    is_only: bool,
 ) -> Admission:
     with reading.open(path) as (recording, indices):
         for issue in recording.issues:
@@ -331,7 +337,11 @@ def _admission(
         first = recording.view(0)
         total, done = frames_to_check(first), count(1)
         begun = None
-        if settings is not None and reading.trajectory is None and BegunSurvey.suits(recording, indices):
+        if (
+            settings is not None
+            and reading.trajectory is None
+            and BegunSurvey.suits(recording, indices, is_only=is_only)
+        ):
             begun = BegunSurvey(recording, indices, settings, tools)
         result = checked(
             first, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
@@ -342,7 +352,8 @@ def _admission(
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         if reading.trajectory is None:
-            return Admission(result, begun=None if begun is None else begun.chain_of(result.rig))
+            has_wheels = len(first.wheel) > 0 and not leaves_wheels_out(result.findings)
+            return Admission(result, begun=None if begun is None else begun.chain_of(result.rig, has_wheels=has_wheels))
         given = reading.trajectory.poses_of(replace(first, calibration=result.rig), indices)
         console.print(f"{recording.name}: {given.words}", markup=False)
         return Admission(result, given)

@@ -84,11 +84,12 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
         made.append((segment, survey if isinstance(survey, str) else _stored(survey, tools.images)))
         del survey  # with its pictures, which are in the survey's own store now
     refused: dict[int, str] = {}
+    unwatched = replace(tools, watch=lambda _: None)  # who watches wants the whole drive
     while wrong := _refusals(made):
         refused |= wrong
         made = [
             # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
-            known or (whole, _survey_segment(how, (whole, _part(whole, inputs), tools.images), tools))
+            known or (whole, _survey_segment(how, (whole, _part(whole, inputs), tools.images), unwatched))
             for whole, known in _regrouped(made, refused)
         ]
     cuts = tuple(

@@ -3,6 +3,7 @@
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -123,12 +124,14 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
         begun = BegunSurvey(recording, np.arange(8), SurveySettings(), SurveyTools(images=images))
         given = recording.calibration
         tried, corrected = replace(given), replace(given)
-        assert begun.chain_of(given) is None
+        chain_of = partial(begun.chain_of, has_wheels=len(recording.wheel) > 0)
+        assert chain_of(given) is None
         first = begun(recording, given, unwatched)
         assert begun(recording, tried, unwatched) != [images]
-        assert [begun.chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
+        assert [chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
         second = begun(replace(recording, calibration=corrected), corrected, unwatched)
-        assert [begun.chain_of(rig) for rig in (given, corrected)] == [None, second]
+        assert [chain_of(rig) for rig in (given, corrected)] == [None, second]
+        assert begun.chain_of(corrected, has_wheels=len(recording.wheel) == 0) is None
         assert first == second == [images]
         long = replace(recording, frame_stamps_ns=np.arange(8, dtype=np.int64) * 20_000_000_000)
         begun(long, tried, unwatched)
