@@ -76,7 +76,7 @@ def _stereo_pixels(pixels: AnyArray, camera: StereoCamera) -> bool:
 _COVARIANCE = Kind("<f8", (6, 6), _covariance)
 _TRANSFORMS = (
     "body_from_cam base_from_body body_from_now odom_from_body previous_from_body new_odom_from_old_odom "
-    "map_from_body map_from_base"
+    "map_from_body map_from_base cam_from_previous"
 )
 ARRAYS: Mapping[str, Kind] = {
     **dict.fromkeys(_TRANSFORMS.split(), Kind("<f8", (4, 4), _rigid)),

@@ -114,7 +114,8 @@ def radius_95_m(cov_rot_trans: Array | None) -> float:
         return inf
     half = 0.5 * (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz))
     cosine = half / cube if cube > 0.0 else 1.0
-    return _RADIUS_95_SIGMAS * sqrt(mean + 2.0 * spread * cos(acos(min(max(cosine, -1.0), 1.0)) / 3.0))
+    largest = mean + 2.0 * spread * cos(acos(min(max(cosine, -1.0), 1.0)) / 3.0)
+    return _RADIUS_95_SIGMAS * sqrt(largest) if largest >= 0.0 else inf  # numbers that lost their meaning bound nothing
 
 
 def known_radius_m(cov_rot_trans: Array | None) -> float | None:

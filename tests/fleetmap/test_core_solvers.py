@@ -57,6 +57,7 @@ def rows(observations: int = 8, unknowns: int = 2, keyframes: int = 3) -> core.B
         np.ones((observations, 4, 3)),
         np.ones((observations, 4, unknowns)),
         np.ones((keyframes, 3)),
+        np.ones(4),
     )
     return calibrated(lambda *_: answer)
 
@@ -74,7 +75,7 @@ def calibrated(rows: Any, *, weight: int = 2, ways: int = 1, scale: int = 1) -> 
         (lambda: calibrated(print, scale=2), "calibration: a weight"),
         (lambda: calibrated(print, ways=2), "calibration: a way"),
         (lambda: calibrated(lambda *_: None).cost(), "rows: residuals, derivatives"),
-        (lambda: calibrated(lambda *_: (np.ones((8, 3)),) * 4).cost(), "rows: residuals, derivatives"),
+        (lambda: calibrated(lambda *_: (np.ones((8, 3)),) * 5).cost(), "rows: residuals, derivatives"),
         (lambda: rows(observations=7).cost(), "rows: residuals of each"),
         (lambda: rows(unknowns=3).reduced(0.0), "rows: derivatives"),
         (lambda: rows(keyframes=2).reduced(0.0), "rows: a position"),
@@ -100,7 +101,7 @@ NUMBERS = [name for name, value in BUNDLE.items() if isinstance(value, np.ndarra
 )
 def test_hostile_numbers_give_values(name: str, numbers: Array, sparse: bool, held: bool) -> None:
     if name == "rows":
-        shapes = (8, 4), (8, 4, 3), (8, 4, 2), (3, 3)
+        shapes = (8, 4), (8, 4, 3), (8, 4, 2), (3, 3), (4,)
         solver = calibrated(lambda *_: tuple(np.resize(numbers, shape) for shape in shapes))
     else:
         solver = bundle(**{name: np.resize(numbers, BUNDLE[name].shape)}, points_held=held)

@@ -53,6 +53,7 @@ def test_bounds_hold_what_they_say() -> None:
     round_cov = np.diag([1.0] * 3 + [0.04] * 3)
     inside = np.linalg.norm(rng.normal(0, 0.2, (20000, 3)), axis=1) < radius_95_m(round_cov)
     assert inside.mean() == pytest.approx(0.95, abs=0.01)
+    assert radius_95_m(-1e-12 * np.eye(6)) == np.inf
     assert radius_95_m(None) == radius_95_m(np.nan * np.eye(6)) == radius_95_m(np.diag([1.0] * 5 + [np.inf])) == np.inf
 
 

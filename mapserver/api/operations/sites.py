@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fleetmap.encoding import MOST
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.mapformat.names import NAME_PATTERN
 from mapserver.api.operations.operation import Caller, Done, operation
@@ -43,7 +42,8 @@ Endpoint = Annotated[
 ]
 Bundles = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")]
 Part = Annotated[str, {}]  # of an address alone
-_NUMBER = {"ge": -MOST, "le": MOST, "examples": [1.57]}
+_MOST = 1e12  # as fleetmap.encoding, which a command line does not wait for
+_NUMBER = {"ge": -_MOST, "le": _MOST, "examples": [1.57]}
 Metres = Annotated[float, _NUMBER]
 Heading = Annotated[float | None, _NUMBER]
 Sigma = Annotated[float, {"gt": 0, "le": 20}]

@@ -65,7 +65,7 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     return state
 
 
-def _observations_of(owners: NDArray[np.int32], count: int) -> scipy.sparse.csr_array:
+def _observations_of(owners: NDArray[np.int32], count: int) -> "scipy.sparse.csr_array":
     """Return (count, M) which of M observations each owner has; owners (M,)."""
     return scipy.sparse.csr_array((np.ones(len(owners), bool), (owners, np.arange(len(owners)))), (count, len(owners)))
 
@@ -74,8 +74,8 @@ def _observations_of(owners: NDArray[np.int32], count: int) -> scipy.sparse.csr_
 class _WindowIndex:
     """Observations by keyframe and by landmark, relative terms by their first keyframe: the cost of a window depends on its size only."""
 
-    by_keyframe: scipy.sparse.csr_array
-    by_landmark: scipy.sparse.csr_array
+    by_keyframe: "scipy.sparse.csr_array"
+    by_landmark: "scipy.sparse.csr_array"
     relative: dict[int, list[RelativeTerm]]
 
 
