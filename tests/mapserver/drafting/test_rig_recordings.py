@@ -148,7 +148,9 @@ def test_further_views_are_examined_beside_the_corrected_first_one(
     monkeypatch.setattr("mapserver.drafting.survey_recordings.checked", checked)
     monkeypatch.setattr("mapserver.drafting.admission.further_findings", further)
     with OpenRecordings(RecordingOptions(), tmp_path) as reading:
-        _admission(recorded, reading, Console(quiet=True), needs_truth=False, settings=None, tools=SurveyTools())
+        _admission(
+            recorded, reading, Console(quiet=True), needs_truth=False, settings=None, tools=SurveyTools(), is_only=True
+        )
         with reading.open(recorded) as (recording, _):
             whole = recording.calibration.cameras
     for camera, nominal, motion in zip(seen[0].cameras, whole, (turn, turn, np.eye(4), np.eye(4)), strict=True):
