@@ -1,7 +1,7 @@
 """Configuration file of `locclient`: the robot, its sensors and outputs, and the localizer."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -62,10 +62,10 @@ class RunSection(Section, frozen=True):
     outbox: str | None = None
     outbox_bytes: int = 50_000_000
     failures: str | None = None
-    replays: str = "blurred"
+    replays: Literal["off", "blurred", "full"] = "blurred"
     replays_bytes: int = 50_000_000
     surveys: bool = False
-    frame_queue: int = 2
+    frame_queue: Annotated[int, msgspec.Meta(ge=1)] = 2
     imu_wait_s: float = 0.05
     window: TileSelectionSettings = TileSelectionSettings()
     trial: TrialSettings = TrialSettings()

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
@@ -174,73 +175,52 @@ class MapAddress:
     identity: RobotIdentity | None = None
     version: int | None = None
 
-
-@dataclass(frozen=True, kw_only=True)
-class GivenAddress:
-    """Settings of the map's address; missing ones come from the identity."""
-
-    site: str | None = None
-    robot: str | None = None
-    server: str | None = None
-    store: str | Path | None = None
-    root: str | Path | None = None
-    identity: str | Path | None = None
-    insecure: bool = False
-    version: int | None = None
-    sign: str = ""  # before the names in messages
-
     @classmethod
-    def of(cls, settings: object, **more: Any) -> Self:
-        """Take the settings of these names from an object, but for those in `more`."""
-        names = [field.name for field in fields(cls) if hasattr(settings, field.name)]
-        return cls(**{name: getattr(settings, name) for name in names} | more)
+    def of(
+        cls, settings: object, *, sign: str = "", usual_robot: str = "", may_be_alone: bool = False, **more: Any
+    ) -> Self:
+        """Return the address by the settings of these names, of an object or in `more`; missing ones come from the identity.
 
-    def resolve(self, usual_robot: str | None = None, *, may_be_alone: bool = False) -> MapAddress:
-        """Return the address. usual_robot: the name of a robot that has none. may_be_alone: with neither, if a link brings its maps.
-
-        UsageError for contradictions, and for a server on another machine that cannot authenticate the robot."""
-        if self.server is not None and self.store is not None:
-            raise UsageError(f"give either {self.sign}server, such as tls/HOST:7447, or {self.sign}store, a folder")
-        folder = identity_folder(self.identity)
-        has_use = self.store is None and (self.server is None or has_tls(self.server))
+        sign: before the names in messages. usual_robot: the name of a robot that has none. may_be_alone: with neither server nor store, if
+        a link brings its maps. UsageError for contradictions, and for a server on another machine that cannot authenticate the robot.
+        """
+        names = [*(field.name for field in fields(cls)), "insecure"]
+        given = SimpleNamespace(**{name: getattr(settings, name, None) for name in names} | more)
+        if given.server is not None and given.store is not None:
+            raise UsageError(f"give either {sign}server, such as tls/HOST:7447, or {sign}store, a folder")
+        folder = identity_folder(given.identity)
+        has_use = given.store is None and (given.server is None or has_tls(given.server))
         identity = RobotIdentity.load(folder) if has_use else None
+        usual = {"site": given.site or None, "robot": given.robot or usual_robot or None}
+
+        def named(what: str) -> str:
+            enrolled: str | None = usual[what] if identity is None else getattr(identity.who, what)
+            if enrolled is None:
+                raise UsageError(f"{sign}{what} is missing: which site's map, and who asks?")
+            if identity is not None and getattr(given, what) not in {None, enrolled}:
+                asked = f"{what} {getattr(given, what)} is asked for"
+                raise UsageError(f"{asked}, but {identity.folder} is enrolled as {what} {enrolled}")
+            return check_name(enrolled, what)
+
         if identity is None:
-            self._named("site", None, None)  # first error of an empty configuration
-        server = self.server or (None if identity is None else identity.who.endpoint)
-        if server is None and self.store is None and not may_be_alone:
+            named("site")  # first error of an empty configuration
+        server = given.server or (None if identity is None else identity.who.endpoint)
+        if server is None and given.store is None and not may_be_alone:
             raise UsageError(
-                f"give either {self.sign}server, such as tcp/127.0.0.1:7447, or {self.sign}store, a folder; or {_ENROL}"
+                f"give either {sign}server, such as tcp/127.0.0.1:7447, or {sign}store, a folder; or {_ENROL}"
             )
         if server is None or not has_tls(server):
             identity = None
-            check_reach(server, insecure=self.insecure)
+            check_reach(server, insecure=bool(given.insecure))
         elif identity is None:
             raise UsageError(f"this robot has no identity in {folder}, which {server} asks for; {_ENROL}")
-        if self.version is not None and self.store is None:
+        if given.version is not None and given.store is None:
             raise UsageError(
-                f"{self.sign}version {self.version} needs {self.sign}store DIR: a server gives the version that its robots should run"
+                f"{sign}version {given.version} needs {sign}store DIR: a server gives the version that its robots should run"
             )
-        return MapAddress(
-            site=check_name(self._named("site", identity, None), "site"),
-            robot=check_name(self._named("robot", identity, usual_robot), "robot"),
-            server=server,
-            store=self.store,
-            root=self.root or (None if identity is None else folder / "root.json"),
-            identity=identity,
-            version=self.version,
-        )
-
-    def _named(self, what: str, identity: RobotIdentity | None, usual: str | None) -> str:
-        given: str | None = getattr(self, what)
-        if identity is None:
-            given = given or usual
-            if given is None:
-                raise UsageError(f"{self.sign}{what} is missing: which site's map, and who asks?")
-            return given
-        enrolled: str = getattr(identity.who, what)
-        if given not in {None, enrolled}:
-            raise UsageError(f"{what} {given} is asked for, but {identity.folder} is enrolled as {what} {enrolled}")
-        return enrolled
+        root = given.root or (None if identity is None else folder / "root.json")
+        where = {"server": server, "store": given.store, "root": root}
+        return cls(site=named("site"), robot=named("robot"), **where, identity=identity, version=given.version)
 
 
 def check_reach(endpoint: str | None, *, insecure: bool) -> None:

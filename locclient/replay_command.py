@@ -51,9 +51,9 @@ class MapOptions:
 
     def address(self, version: int | None) -> "MapAddress":
         """Return the map's address; UsageError unless the options name one map, and for a version with a server."""
-        from locclient.identity import GivenAddress
+        from locclient.identity import MapAddress
 
-        return GivenAddress.of(self, version=version, sign="--").resolve("replay")
+        return MapAddress.of(self, version=version, sign="--", usual_robot="replay")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,15 +22,14 @@ from locclient.config import LocclientConfig, RunSection, image_priors_of, links
 from locclient.daemon.publishers import output_of
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
-from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import ReplayQueue
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.hooks import LinkedRobot
-from locclient.identity import GivenAddress, MapAddress, check_reach
+from locclient.identity import MapAddress, check_reach
 from locclient.localization.priors.given import parse_prior
 from locclient.maps.building_maps import BuildingMaps
-from locclient.maps.map_client import cache_folder, map_client, open_bus, outbox_path
+from locclient.maps.map_client import cache_folder, map_client, open_bus
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource, address_of
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -45,7 +44,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
     """Check the configuration and return the map's address; UsageError names missing or contradicting settings of [run]."""
     run, links = config.run, links_of(config)
     try:
-        address = GivenAddress.of(run).resolve(may_be_alone=bool(links))
+        address = MapAddress.of(run, may_be_alone=bool(links))
     except UsageError as error:
         raise UsageError(f"[run] {error}") from error
     try:
@@ -53,10 +52,6 @@ def check_run(config: LocclientConfig) -> MapAddress:
     except UsageError as error:
         raise UsageError(f"[output] endpoint = {error}") from error
     output_of(config.output).check(config.output, config.topics)
-    if run.replays not in ("off", *PICTURES):
-        raise UsageError(f"[run] replays = {run.replays!r}: choose off, {' or '.join(PICTURES)}")
-    if run.frame_queue < 1:
-        raise UsageError(f"[run] frame_queue = {run.frame_queue}: must be at least 1")
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
         raise UsageError(
             f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
@@ -88,7 +83,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             has_imu=calibration.imu is not None,
             imu_wait_s=run.imu_wait_s,
         )
-        spool = configured_outbox(run, address)
+        spool = outbox_file(run, address)
         outbox = _opened_outbox(spool, run.outbox_bytes)
         stack.enter_context(gc_frozen())
         caches: tuple[TileCache, ...] = ()
@@ -224,6 +219,7 @@ def _server(
     return server
 
 
-def configured_outbox(run: RunSection, address: MapAddress) -> Path:
-    """Return the file of the spool: as set, else beside the default cache."""
-    return outbox_path(address.site, address.robot) if run.outbox is None else Path(run.outbox)
+def outbox_file(run: RunSection, address: MapAddress) -> Path:
+    """Return the file of the spool: as set, else beside the default cache, one for each robot of the machine."""
+    default = cache_folder().parent / "spool" / f"{address.site}.{address.robot}.sqlite3"
+    return default if run.outbox is None else Path(run.outbox)

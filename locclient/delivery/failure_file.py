@@ -35,7 +35,6 @@ from locclient.robot.failure_onset import block_px, reduced
 from locclient.robot.failure_report import RobotProfile, without_detail
 from locclient.robot.failure_ring import Commands, FailureCut, RingFrame, UsedMap
 
-PICTURES = ("full", "blurred")
 _FORMAT = 3
 _WIDTH_PX = 320  # of pictures
 _QUALITIES, _PICTURE_BYTES = (70, 50, 30), 24 << 10
@@ -59,7 +58,7 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile) -> bytes:
-    """Return the MCAP file of a complete cut, with pictures by the profile: one of PICTURES."""
+    """Return the MCAP file of a complete cut, with pictures by the profile, full or blurred."""
     assert cut.frames
     used = cut.used or next((f.commands.used for f in cut.frames if f.commands.used is not None), None)
     summary = FailureSummary(

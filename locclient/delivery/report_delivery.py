@@ -61,18 +61,16 @@ def deliver_replay_part(client: MapClient, outbox: Outbox) -> bool:
     except LinkError as error:  # an older server does not accept recordings: reports and maps continue
         _log.info("the recording of failure %s waits: %s", replay.id, error)
         return False
+    outbox.received_bytes[replay.id] = ack.received_bytes
     if ack.refused or ack.id != replay.id:
         _log.warning("the server will not keep the recording of failure %s: %s", replay.id, ack.refused or ack.id)
         outbox.refused(replay.id)
     elif ack.received_bytes >= len(replay.payload):
         _log.info("the recording of failure %s is delivered: %d bytes", replay.id, len(replay.payload))
         outbox.done(replay.id)
-    elif ack.received_bytes == offset:
-        return False  # the server accepted nothing
     else:
-        outbox.received_bytes[replay.id] = ack.received_bytes
-        return True
-    outbox.received_bytes.pop(replay.id, None)
+        return ack.received_bytes != offset  # else the server accepted nothing
+    del outbox.received_bytes[replay.id]
     return True
 
 

@@ -56,18 +56,26 @@ class ImageQualityMonitor:
 
     def judge(self, frame: RectifiedFrame | CameraFrame) -> ImageQuality:
         """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
-        thinned = [_ThinnedImage.of(image) for image in (frame.left, frame.right) if image is not None]
-        self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
+        thinned = [_thinned(image) for image in (frame.left, frame.right) if image is not None]
+        # An image that is bit-identical to the last one: sensor noise never repeats.
+        pixels = [image[0] for image in thinned]
+        pairs = zip(thinned, self._last, strict=False)
+        self._frozen = [contrast > 1.0 and own == last for (own, _, contrast, _), last in pairs]
+        self._last[: len(pixels)] = pixels
         count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
         variance = squares / count - (total / count) ** 2
         typical = median(self._sharpness) if self._sharpness else variance
-        cause = self._exposure_fault(thinned[0])
-        if cause is Cause.NONE and any(self._frozen):
+        (_, mean, contrast, bright_share), settings = thinned[0], self._settings
+        if contrast < settings.dark_contrast:
+            cause = Cause.DARK if mean < 128.0 else Cause.GLARE
+        elif bright_share > settings.glare_share:
+            cause = Cause.GLARE
+        elif any(self._frozen):
             cause = Cause.FROZEN
-        if cause is Cause.NONE:
+        else:
             self._sharpness.append(variance)
-            cause = Cause.BLURRED if variance < self._settings.blurred_share * typical else Cause.NONE
-        return ImageQuality(cause, thinned[0].mean / 255.0, variance / max(typical, 1e-9))
+            cause = Cause.BLURRED if variance < settings.blurred_share * typical else Cause.NONE
+        return ImageQuality(cause, mean / 255.0, variance / max(typical, 1e-9))
 
     def without_frozen(self, frame: RectifiedFrame) -> RectifiedFrame:
         """Return `frame`, just judged, without images of a stuck camera: no right image, or an empty left one."""
@@ -82,28 +90,9 @@ class ImageQualityMonitor:
         self._depths_m.append(scene_depth_m)
         return Cause.NONE
 
-    def _exposure_fault(self, left: "_ThinnedImage") -> Cause:
-        if left.contrast < self._settings.dark_contrast:
-            return Cause.DARK if left.mean < 128.0 else Cause.GLARE
-        return Cause.GLARE if left.bright_share > self._settings.glare_share else Cause.NONE
 
-    def _is_frozen(self, side: int, image: "_ThinnedImage") -> bool:
-        """Return True for an image that is bit-identical to the last one: sensor noise never repeats."""
-        last, self._last[side] = self._last[side], image.pixels
-        return image.contrast > 1.0 and last == image.pixels
-
-
-@dataclass(frozen=True, slots=True)
-class _ThinnedImage:
-    """Every eighth pixel of every eighth row, with mean, standard deviation and share of nearly white pixels."""
-
-    pixels: bytes
-    mean: float
-    contrast: float
-    bright_share: float
-
-    @classmethod
-    def of(cls, image: Image) -> "_ThinnedImage":
-        pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
-        mean, count = total / len(pixels), len(pixels)
-        return cls(pixels, mean, sqrt(max(squares / count - mean * mean, 0.0)), brights / count)
+def _thinned(image: Image) -> tuple[bytes, float, float, float]:
+    """Return every eighth pixel of every eighth row, with mean, standard deviation and share of nearly white pixels."""
+    pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
+    mean, count = total / len(pixels), len(pixels)
+    return pixels, mean, sqrt(max(squares / count - mean * mean, 0.0)), brights / count

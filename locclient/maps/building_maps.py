@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError, MapFormatError, UnreachableError
 from fleetmap.mapformat.building import (
     ALIGNMENT,
@@ -109,11 +108,10 @@ class BuildingMaps:
         wanted = source.newest(asks=asks)
         if wanted == self.held.get(source.site):
             return None
-        manifest = source.manifest(wanted)
-        tiles = source.tiles(manifest)
-        for reason in tiles.refused.values():
+        loaded = source.load(wanted, source.manifest(wanted))
+        for reason in loaded.refused.values():
             _log.warning("floor %s: a tile is left out: %s", source.site, reason)
-        return LoadedMap(wanted, manifest, decode_vocabulary(source.vocabulary(manifest)), tiles.tiles)
+        return loaded
 
     def _note(self, site: str, fault: str) -> None:
         if fault and fault != self._faults.get(site):

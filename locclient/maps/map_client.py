@@ -369,11 +369,6 @@ def connected(
             _log.warning("tile cache: %s", fault)
 
 
-def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:
-    """Return the file of the outbox beside the tile cache, one for each robot of the machine."""
-    return cache_folder(cache).parent / "spool" / f"{site}.{robot}.sqlite3"
-
-
 def cache_folder(setting: str | Path | None = None) -> Path:
     """Return the folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
     if setting is not None:

@@ -6,11 +6,11 @@ import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fleetmap.bow.vocabulary import shipped_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary, shipped_vocabulary
 from fleetmap.errors import (
     FleetmapError,
     LinkError,
@@ -25,15 +25,8 @@ from fleetmap.mapformat.names import blob_path, check_name, check_sha256, curren
 from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import WantedVersion
+from locclient.maps.loaded_map import Cell, LoadedMap
 from locclient.maps.tile_cache import TileCache
-
-
-@dataclass(frozen=True)
-class FetchedTiles:
-    """Valid tiles, and for each other one the reason why it is missing."""
-
-    tiles: dict[tuple[int, int], Tile] = field(default_factory=dict)
-    refused: dict[tuple[int, int], str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -77,12 +70,19 @@ class MapSource(ABC):
         entry = manifest.vocabulary
         return shipped_vocabulary(entry.sha256) or self.blob(entry.sha256, entry.bytes)
 
-    def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Return tiles of the version: all, or those of `cells` that it has. An unusable tile is refused with its reason.
+    def load(self, wanted: WantedVersion, manifest: Manifest, cells: Iterable[Cell] | None = None) -> LoadedMap:
+        """Return the version with all usable tiles, or those of `cells`; errors of its vocabulary as of `blob`."""
+        tiles, refused = self.tiles(manifest, cells)
+        return LoadedMap(wanted, manifest, decode_vocabulary(self.vocabulary(manifest)), tiles, refused=refused)
+
+    def tiles(
+        self, manifest: Manifest, cells: Iterable[Cell] | None = None
+    ) -> tuple[dict[Cell, Tile], dict[Cell, str]]:
+        """Return tiles of the version, all or those of `cells` that it has, and for each unusable one the reason.
 
         After a request without an answer only tiles at hand are read, so that a robot without a network does not wait for each of them.
         """
-        fetched, away = FetchedTiles(), None
+        tiles, refused, away = dict[Cell, Tile](), dict[Cell, str](), None
         asked = None if cells is None else set(cells)
         for entry in manifest.tiles:
             cell = (entry.x, entry.y)
@@ -91,11 +91,11 @@ class MapSource(ABC):
                     if away is not None and not self._is_at_hand(entry.sha256):
                         raise away
                     data = self.blob(entry.sha256, entry.bytes)
-                    fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, data)
+                    tiles[cell] = checked_tile(entry, manifest.tile_size_m, data)
                 except FleetmapError as error:
                     away = error if isinstance(error, UnreachableError) else away
-                    fetched.refused[cell] = str(error)
-        return fetched
+                    refused[cell] = str(error)
+        return tiles, refused
 
     def _is_at_hand(self, sha256: str) -> bool:
         return True

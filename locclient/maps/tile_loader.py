@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import WantedVersion
 from fleetmap.version_grid import OccupancyGrid, grid_of, occupancy
@@ -25,16 +24,14 @@ class TileLoader:
         """
         sha256 = wanted.manifest_sha256 or ""
         if sha256 not in self._versions:
-            manifest = self._source.manifest(wanted)
-            vocabulary = decode_vocabulary(self._source.vocabulary(manifest))
-            self._versions[sha256] = LoadedMap(wanted, manifest, vocabulary, {}), None
+            self._versions[sha256] = self._source.load(wanted, self._source.manifest(wanted), ()), None
         known, held = self._versions[sha256]
         cells = select_tiles(known.manifest, held, bound, self.settings)
         if cells == held:
             return None
-        fetched = self._source.tiles(known.manifest, cells - known.tiles.keys() - known.refused.keys())
-        tiles = {cell: tile for cell, tile in (known.tiles | fetched.tiles).items() if cell in cells}
-        loaded = replace(known, tiles=tiles, refused=known.refused | fetched.refused)
+        fetched, refused = self._source.tiles(known.manifest, cells - known.tiles.keys() - known.refused.keys())
+        tiles = {cell: tile for cell, tile in (known.tiles | fetched).items() if cell in cells}
+        loaded = replace(known, tiles=tiles, refused=known.refused | refused)
         self._versions[sha256] = loaded, cells if tiles or not loaded.refused else held
         if not tiles and loaded.refused:
             reasons = "; ".join(loaded.refused.values())

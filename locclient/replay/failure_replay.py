@@ -7,13 +7,12 @@ odometry, which does not depend on the map, is unchanged.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from math import dist, pi, remainder
 
 import numpy as np
 
-from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_definition import BLIND_S, is_blind
 from fleetmap.failure_summary import FailureSummary, Moment
@@ -147,11 +146,8 @@ def _loaded(source: MapSource, site: str, used: UsedMap, other_sha256: str | Non
             for tile in manifest.tiles
             if min(columns) <= tile.x <= max(columns) and min(rows) <= tile.y <= max(rows)
         )
-    found = source.tiles(manifest, cells)
-    missing = [cell for cell in cells if cell not in found.tiles]
-    if missing:
-        reason = found.refused.get(missing[0], "the version does not have it")
+    loaded = source.load(WantedVersion(site=site, version=manifest.version, manifest_sha256=sha256), manifest, cells)
+    if missing := [cell for cell in cells if cell not in loaded.tiles]:
+        reason = loaded.refused.get(missing[0], "the version does not have it")
         raise LinkError(f"tile {missing[0]} of version {manifest.version} is not available: {reason}")
-    wanted = WantedVersion(site=site, version=manifest.version, manifest_sha256=sha256)
-    vocabulary = decode_vocabulary(source.vocabulary(manifest))
-    return LoadedMap(wanted, manifest, vocabulary, {cell: found.tiles[cell] for cell in cells})
+    return replace(loaded, tiles={cell: loaded.tiles[cell] for cell in cells})

@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
-from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import LinkError, RecordingError
 from fleetmap.free_memory import gc_frozen, give_back_free_memory
 from fleetmap.geometry import Array, rotation_angle_rad
@@ -22,12 +21,12 @@ from fleetmap.sensors.rectification import MountedCamera, Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
-from locclient.identity import GivenAddress, MapAddress
+from locclient.identity import MapAddress
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_client import connected
-from locclient.maps.map_source import FetchedTiles, MapSource
+from locclient.maps.map_source import MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_result import ReplayResult
@@ -64,21 +63,20 @@ class ReplayOptions:
     robot: str | None = None
 
 
-def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
-    """Return the version to run with all usable tiles, the refused tiles, and a note if it is not the wanted version.
+def load_map(source: MapSource) -> tuple[LoadedMap, str]:
+    """Return the version to run with all usable tiles, and a note if it is not the wanted version.
 
     Raises LinkError if no map is available.
     """
     ready = source.ready()
     manifest = source.manifest(ready.wanted)
-    tiles = source.tiles(manifest)
+    loaded = source.load(ready.wanted, manifest)
     if not manifest.tiles:
         raise LinkError(f"version {manifest.version} of site {manifest.site} has no tile at all; publish another one")
-    if not tiles.tiles:
-        reason = f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}"
+    if not loaded.tiles:
+        reason = f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {loaded.refused}"
         raise LinkError(reason)
-    vocabulary = decode_vocabulary(source.vocabulary(manifest))
-    return LoadedMap(ready.wanted, manifest, vocabulary, tiles.tiles), tiles, ready.note
+    return loaded, ready.note
 
 
 @gc_frozen()
@@ -91,7 +89,7 @@ def replay(
     unreadable.
     """
     cv2.setNumThreads(1)  # one thread, so that figures are those of one core
-    loaded, tiles, note = load_map(maps)
+    loaded, note = load_map(maps)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
     found = options.open_priors(rectifier.mounted[0], source.calibration.base_from_body)
     robot = Robot(rectifier, options.settings, TrialSettings(), time.process_time, image_priors=found)
@@ -100,7 +98,7 @@ def replay(
     if prior is not None:
         robot.localizer.handle_prior(prior)
     truth_in_map = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
-    result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [], truth_in_map=truth_in_map)
+    result = ReplayResult([], [], [], loaded, [note] if note else [], truth_in_map=truth_in_map)
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     if options.export is not None:
         profile = RobotProfile(maps.site, options.robot or "replay", rectifier.rig, options.settings)
@@ -265,5 +263,5 @@ def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS)
 
 def _address(maps: str | Path, site: str, options: LocalizeOptions) -> MapAddress:
     is_server = isinstance(maps, str) and _ENDPOINT.match(maps) is not None
-    place: dict[str, str | Path] = {"server" if is_server else "store": maps}
-    return GivenAddress.of(options, site=site, **place).resolve("replay")
+    place: dict[str, Any] = {"server" if is_server else "store": maps}
+    return MapAddress.of(options, usual_robot="replay", site=site, **place)

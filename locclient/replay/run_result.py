@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.geometry import Array, align_points, transform_points
-from fleetmap.mapformat.manifest import Manifest
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import Stamps, Trajectory
 from locclient.localization.estimate import Estimate
-from locclient.maps.map_source import FetchedTiles
+from locclient.maps.loaded_map import LoadedMap
 from locclient.replay.plots import RunPlot, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
 from locclient.robot.health_report import SearchWay
@@ -25,15 +24,14 @@ class ReplayResult:
 
     truth_in_map: True if the ground truth is in the frame `map`; else it has its own frame, and errors are known only after a fit.
 
-    manifest, tiles: the map that was used. notes: texts for users about the run. failures: number detected by the robot.
+    loaded: the map that was used. notes: texts for users about the run. failures: number detected by the robot.
     search: distance driven without localization at the end.
     """
 
     frames: list[FrameRecord]
     estimates: list[Estimate]
     truths: list[Array | None]
-    manifest: Manifest
-    tiles: FetchedTiles
+    loaded: LoadedMap
     notes: list[str] = field(default_factory=list)
     failures: int = 0
     truth_in_map: bool = True
@@ -92,10 +90,10 @@ class ReplayResult:
             **{name: metric(self.frames) for name, metric in METRICS.items()},
             "aligned_error_m": self.aligned_error_m(),
             "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-            "map_version": self.manifest.version,
-            "site": self.manifest.site,
-            "tiles": len(self.tiles.tiles),
-            "tiles_refused": {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())},
+            "map_version": self.loaded.version,
+            "site": self.loaded.manifest.site,
+            "tiles": len(self.loaded.tiles),
+            "tiles_refused": {f"{x},{y}": reason for (x, y), reason in sorted(self.loaded.refused.items())},
             "not_localised_m": self.search.metres,
             "failures_detected": self.failures,
             "notes": self.notes,
@@ -110,11 +108,11 @@ class ReplayResult:
     def save_picture(self, path: str | Path) -> None:
         """Draw path, landmarks and errors into a PNG file; UsageError if it cannot be written."""
         plot = RunPlot(
-            title=f"{self.manifest.site}, version {self.manifest.version}",
+            title=f"{self.loaded.manifest.site}, version {self.loaded.version}",
             frames=self.frames,
             positions_map_m=self.map_from_body[:, :3, 3],
             truths_map_m=_stacked([truth if self.truth_in_map else None for truth in self.truths], 4)[:, :3, 3],
-            landmarks_map_m=np.concatenate([tile.points_map for tile in self.tiles.tiles.values()]),
+            landmarks_map_m=np.concatenate([tile.points_map for tile in self.loaded.tiles.values()]),
         )
         save_picture(plot, Path(path))
 

@@ -18,7 +18,6 @@ from fleetmap.failure_definition import (
 )
 from fleetmap.messages import Cause, FailureKind, FixNote, Status
 from locclient.localization.estimate import Estimate
-from locclient.localization.image_quality import ImageQuality
 
 _FIX_NOTES = 20
 _MAX_REFUSED_CHARS = 500
@@ -29,7 +28,7 @@ CONTRADICTING_LOOKS = 3  # one refused fix is chance, several in a row are a dou
 class Failure:
     """A failure, reported once.
 
-    stamp_ns: of its first frame. estimate: of the frame of its detection; image: of the same frame, None without one.
+    stamp_ns: of its first frame. estimate: of the frame of its detection, or the last one before frames were missing.
     """
 
     kind: FailureKind
@@ -37,7 +36,6 @@ class Failure:
     stamp_ns: int
     duration_s: float
     estimate: Estimate
-    image: ImageQuality | None
     fixes: tuple[FixNote, ...]
 
 
@@ -166,8 +164,7 @@ class FailureMonitor:
     def _detected(self, kind: FailureKind, cause: Cause, began_ns: int, now_ns: int) -> Failure:
         assert self._last is not None
         self.is_running = True
-        image = None if cause is Cause.NO_FRAMES else self._last.image
-        return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, image, tuple(self._fixes))
+        return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, tuple(self._fixes))
 
 
 def failure_cause(estimate: Estimate) -> Cause:

@@ -116,7 +116,8 @@ class RobotProfile:
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
     """Return the message. wall_ns: the robot's wall clock when the failure began."""
-    failure, onset, image = context.failure, context.onset, context.failure.image
+    failure, onset = context.failure, context.onset
+    image = None if failure.cause is Cause.NO_FRAMES else failure.estimate.image
     belief, map_from_base, is_own = onset.belief, None, failure.estimate.is_at_home
     # The server has no place for a pose in another site's map.
     if onset.map_from_body is not None and is_own and not (belief and belief.floor):

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import robot_key
 from locclient.config import LocclientConfig, RunSection
 from locclient.daemon.daemon import check_run
-from locclient.identity import GivenAddress, RobotIdentity, check_reach, identity_folder
+from locclient.identity import MapAddress, RobotIdentity, check_reach, identity_folder
 from locclient.outputs import OutputSection
 from mapserver.store import MapStore
 from mapserver.trust import init_here
@@ -78,8 +78,8 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
     with pytest.raises(LinkError, match="the bundle was already used"):
         RobotIdentity.enrol(tmp_path / "thief", bundle)
     with pytest.raises(UsageError, match=r"half an identity, without robot\.pem: its enrolment did not end; enrol it"):
-        replace(GIVEN, identity=tmp_path / "thief").resolve()
-    assert replace(GIVEN, identity=tmp_path / "thief", server="tcp/127.0.0.1:7447").resolve().robot == "r1"
+        address(identity=tmp_path / "thief")
+    assert address(identity=tmp_path / "thief", server="tcp/127.0.0.1:7447").robot == "r1"
     before = identity.certificate()
     now = datetime.now(UTC)
     assert not identity.is_renewal_due(now)
@@ -132,42 +132,43 @@ def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkey
     assert time.monotonic() - begun_s < 40
 
 
-GIVEN = GivenAddress(site="lab", robot="r1", identity="nowhere", sign="--")
+def address(**given: object) -> MapAddress:
+    return MapAddress.of(None, sign="--", **{"site": "lab", "robot": "r1", "identity": "nowhere"} | given)
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (replace(GIVEN, server="tcp/127.0.0.1:7447", store="maps"), "either --server"),
-        (GIVEN, "locclient enrol"),
-        (replace(GIVEN, site=None), "--site is missing"),
-        (replace(GIVEN, server="tcp/127.0.0.1:7447", robot=None), "--robot is missing"),
-        (replace(GIVEN, server="tcp/10.0.0.1:7447"), "another machine and without TLS"),
-        (replace(GIVEN, server="tls/10.0.0.1:7447"), "no identity in nowhere"),
-        (replace(GIVEN, server="tls/127.0.0.1:7447", insecure=True), "no identity in nowhere"),
-        (replace(GIVEN, server="nonsense"), "endpoint"),
+        ({"server": "tcp/127.0.0.1:7447", "store": "maps"}, "either --server"),
+        ({}, "locclient enrol"),
+        ({"site": None}, "--site is missing"),
+        ({"server": "tcp/127.0.0.1:7447", "robot": None}, "--robot is missing"),
+        ({"server": "tcp/10.0.0.1:7447"}, "another machine and without TLS"),
+        ({"server": "tls/10.0.0.1:7447"}, "no identity in nowhere"),
+        ({"server": "tls/127.0.0.1:7447", "insecure": True}, "no identity in nowhere"),
+        ({"server": "nonsense"}, "endpoint"),
     ],
 )
-def test_addresses_that_cannot_be_right(given: GivenAddress, said: str) -> None:
+def test_addresses_that_cannot_be_right(given: dict[str, object], said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        given.resolve()
+        address(**given)
 
 
 def test_addresses(tmp_path: Path, server: Server) -> None:
     folder = tmp_path / "identity"
     identity = RobotIdentity.enrol(folder, server.bundle("r1"))
-    bare = replace(GIVEN, site=None, robot=None, identity=str(folder))
-    found = bare.resolve()
+    bare = {"site": None, "robot": None, "identity": str(folder)}
+    found = address(**bare)
     assert (found.site, found.robot, found.server) == ("lab", "r1", identity.who.endpoint)
     assert found.root == folder / "root.json"
     assert found.identity.tls == TlsFiles(folder / "servers.ca", folder / "robot.pem")
     with pytest.raises(UsageError, match="robot r2 is asked for"):
-        replace(bare, robot="r2").resolve()
+        address(**bare | {"robot": "r2"})
     # On loopback and in a store's folder the identity is out of play.
-    for other in (replace(GIVEN, server="tcp/127.0.0.1:7447"), replace(GIVEN, store="maps")):
-        found = replace(other, site="yard", identity=str(folder)).resolve()
+    for other in ({"server": "tcp/127.0.0.1:7447"}, {"store": "maps"}):
+        found = address(**other, site="yard", identity=str(folder))
         assert (found.site, found.identity, found.root) == ("yard", None, None)
-    assert replace(GIVEN, server="tcp/10.0.0.1:7447", insecure=True).resolve().identity is None
+    assert address(server="tcp/10.0.0.1:7447", insecure=True).identity is None
 
 
 def test_the_usual_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

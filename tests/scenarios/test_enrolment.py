@@ -10,7 +10,7 @@ import zenoh
 from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import WantedVersion, decode_message, encode_message, robot_key
-from locclient.identity import GivenAddress, RobotIdentity
+from locclient.identity import MapAddress, RobotIdentity
 from locclient.maps.map_client import connected
 from mapserver import releases
 from mapserver.store import MapStore
@@ -71,7 +71,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
             thief = stack.enter_context(attacker(site.endpoint, one))
             honest = stack.enter_context(Bus(two.who.endpoint, tls=two.tls).open())
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
-            address = GivenAddress(identity=two.folder).resolve()
+            address = MapAddress.of(None, identity=two.folder)
             with connected(address, site.folder / "cache", 10**8) as maps:
                 assert (maps.ready().wanted.version, address.robot) == (1, "r2")
         # Row 2: the same while the server starts; who was connected before is there first.

@@ -19,7 +19,7 @@ from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source, open_source
 from locclient.config import LocclientConfig
-from locclient.daemon.daemon import check_run, configured_outbox
+from locclient.daemon.daemon import check_run, outbox_file
 from locclient.delivery.outbox import Outbox
 from locclient.identity import MapAddress, RobotIdentity
 from locclient.localization.calibration.monitor import FAULTS, PairOrder, pair_order
@@ -176,7 +176,7 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 
 def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
-    path = configured_outbox(config.run, address)
+    path = outbox_file(config.run, address)
     outbox = Outbox(path, max_bytes=config.run.outbox_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
@@ -191,8 +191,8 @@ def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
 def _store(address: MapAddress) -> Iterator[Finding]:
     source = LocalMapSource(Path(str(address.store)), address.site)
     wanted = source.wanted()
-    fetched = source.tiles(source.manifest(wanted))
-    yield _pieces("store", wanted.version, len(fetched.tiles), list(fetched.refused.values()))
+    tiles, refused = source.tiles(source.manifest(wanted))
+    yield _pieces("store", wanted.version, len(tiles), list(refused.values()))
 
 
 def _identity(identity: RobotIdentity, now: datetime) -> Iterator[Finding]:

@@ -61,11 +61,10 @@ def read_factsheet(path: Path, spoken: Dialect) -> dict[str, Any]:
     """
     with disk_errors(f"[vda5050] factsheet {path} cannot be read", "check the path", UsageError):
         data = path.read_bytes()[: MAX_PAYLOAD_BYTES + 1]
-    is_old = spoken.major == "v2"
     try:
         if len(data) > MAX_PAYLOAD_BYTES:
             raise ValueError(f"more than {MAX_PAYLOAD_BYTES} bytes")
-        msgspec.json.decode(data, type=_type(_OLD if is_old else _NEW))
+        msgspec.json.decode(data, type=_type(_OLD if spoken.is_old else _NEW))
         sheet: dict[str, Any] = msgspec.json.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise UsageError(
@@ -74,16 +73,16 @@ def read_factsheet(path: Path, spoken: Dialect) -> dict[str, Any]:
     kinds, features = sheet["typeSpecification"]["localizationTypes"], sheet["protocolFeatures"]
     if "NATURAL" not in kinds:
         kinds.append("NATURAL")
-    ours = [kind for kind in PARAMETERS if not is_old or kind != "clearInstantActions"]
+    ours = [kind for kind in PARAMETERS if not spoken.is_old or kind != "clearInstantActions"]
     described = [_described(kind, spoken) for kind in ours if spoken.has_maps or kind not in MAP_ACTIONS]
-    key, own = "agvActions" if is_old else "mobileRobotActions", {action["actionType"] for action in described}
+    key, own = "agvActions" if spoken.is_old else "mobileRobotActions", {action["actionType"] for action in described}
     features[key] = [*(action for action in features[key] if action["actionType"] not in own), *described]
     return {key: value for key, value in sheet.items() if key not in _HEADER}
 
 
 def _described(action_type: str, spoken: Dialect) -> dict[str, Any]:
     found: dict[str, Any] = {"actionType": spoken.action_name(action_type), "actionScopes": ["INSTANT"]}
-    if spoken.major != "v2":  # the schema of 2.1 allows no list of blockingTypes
+    if not spoken.is_old:  # the schema of 2.1 allows no list of blockingTypes
         found |= {"blockingTypes": ["NONE"], "pauseAllowed": False, "cancelAllowed": False}
     listed = [
         {"key": key, "valueDataType": kind.rstrip("?"), "isOptional": kind.endswith("?")}

@@ -14,7 +14,7 @@ from fleetmap.errors import UsageError, disk_errors
 from fleetmap.threads import Jobs
 from locclient.hooks import LinkedRobot, RobotLink
 from locclient.plugins.vda5050.adapter import FleetAdapter
-from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
 from locclient.plugins.vda5050.fleet_maps import FleetMaps, Origins
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
@@ -40,7 +40,7 @@ class MqttLink:
     ) -> None:
         """Raises UsageError if paho-mqtt is missing, or the broker's authorities cannot be read."""
         self.adapter, self._broker, self._section, self._factsheet = adapter, broker, section, factsheet
-        self._dialect = dialect(section.version)
+        self._dialect = Dialect(section.version)
         self._prefix = f"{section.interface}/{self._dialect.major}/{section.manufacturer}/{section.serial_number}"
         self._sent: Counter[str] = Counter()
         self._state_at_s, self._shown_at_s = 0.0, 0.0
@@ -59,7 +59,7 @@ class MqttLink:
         from paho.mqtt.properties import Properties
 
         more: dict[str, Any] = {}
-        if self._dialect.major != "v2":
+        if not self._dialect.is_old:
             limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             limits.MaximumPacketSize = _MAX_PACKET_BYTES  # the broker keeps larger ones back
             more = {"clean_start": True, "properties": limits}
@@ -89,7 +89,7 @@ class MqttLink:
             ) from error
         name = f"{self._section.manufacturer}-{self._section.serial_number}"
         kind: dict[str, Any] = {"protocol": mqtt.MQTTv5}
-        if self._dialect.major == "v2":  # whose brokers need not know MQTT 5
+        if self._dialect.is_old:  # whose brokers need not know MQTT 5
             kind = {"protocol": mqtt.MQTTv311, "clean_session": True}
 
         class BoundedClient(mqtt.Client):
@@ -189,7 +189,7 @@ def open_link(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
         ca = None if section.download_ca is None else Path(section.download_ca)
         maps = FleetMaps(robot, Origins(section.download_from, token, ca, robot.insecure))
     adapter = FleetAdapter(section, maps, robot)
-    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), dialect(section.version))
+    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), Dialect(section.version))
     mqtt = MqttLink(check_section(section, insecure=robot.insecure), section, adapter, sheet)
     return RobotLink(
         start=mqtt.start,

@@ -2,7 +2,9 @@
 
 import re
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
 
 from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.config import Section
@@ -11,7 +13,7 @@ from fleetmap.errors import UsageError, disk_errors
 _LEVEL = re.compile(r"[^/+#\0]{1,128}")
 _BROKER = re.compile(r"(mqtts?)://([^/:@\s]+|\[[0-9a-fA-F:]+\])(?::(\d{1,5}))?/?")
 _MAX_SECRET_BYTES = 4096
-_LEAST_SIGMA_M = 0.15  # priors up to 0.1 count as a dock's, against which estimates are checked
+_Positive = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 
 
 class Vda5050Section(Section, frozen=True):
@@ -33,11 +35,12 @@ class Vda5050Section(Section, frozen=True):
     download_ca: str | None = None
     robot_actions: tuple[str, ...] = ()
     factsheet: str | None = None
-    state_interval_s: float = 1.0
-    robot_silent_s: float = 10.0
-    initialize_s: float = 15.0
-    initial_sigma_m: float = 0.5
-    initial_sigma_rad: float = 0.2
+    state_interval_s: Annotated[float, msgspec.Meta(gt=0, le=30)] = 1.0  # VDA 5050 wants 30 at most
+    robot_silent_s: _Positive = 10.0
+    initialize_s: _Positive = 15.0
+    # Priors up to 0.1 count as a dock's, against which estimates are checked
+    initial_sigma_m: Annotated[float, msgspec.Meta(ge=0.15, le=3600)] = 0.5
+    initial_sigma_rad: _Positive = 0.2
 
 
 class Broker(NamedTuple):
@@ -60,15 +63,6 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
         value = getattr(section, name)
         if not _LEVEL.fullmatch(value):
             raise UsageError(f"[vda5050] {name} = {value!r}: a level of an MQTT topic, without / + and #, is needed")
-    for name in ("state_interval_s", "robot_silent_s", "initialize_s", "initial_sigma_m", "initial_sigma_rad"):
-        if not 0 < getattr(section, name) <= 3600:
-            raise UsageError(f"[vda5050] {name} = {getattr(section, name)} must be between 0 and 3600")
-    if section.initial_sigma_m < _LEAST_SIGMA_M:
-        raise UsageError(
-            f"[vda5050] initial_sigma_m = {section.initial_sigma_m}: at least {_LEAST_SIGMA_M}, or it is a dock's"
-        )
-    if section.state_interval_s > 30:
-        raise UsageError(f"[vda5050] state_interval_s = {section.state_interval_s}: VDA 5050 wants 30 at most")
     if section.version == "2.0.0" and section.versions == "fleet manager":
         raise UsageError(
             '[vda5050] version = "2.0.0" has no actions on maps: set versions = "map server", or version = "2.1.0"'

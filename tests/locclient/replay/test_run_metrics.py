@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_exp
 from fleetmap.messages import Status
-from locclient.maps.map_source import FetchedTiles
 from locclient.replay import run_metrics
 from locclient.replay.plots import RunPlot, draw_run, ticks
 from locclient.replay.run_metrics import METRICS, FrameRecord
@@ -217,7 +216,7 @@ def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: floa
             truths[number] = truth_from_map @ np.block(
                 [[np.eye(3), place[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]
             )
-    return ReplayResult(frames, estimates, truths, None, FetchedTiles({}, {}), truth_in_map=False)  # type: ignore[arg-type]
+    return ReplayResult(frames, estimates, truths, None, truth_in_map=False)  # type: ignore[arg-type]
 
 
 def test_errors_against_a_truth_in_another_frame_are_aligned() -> None:

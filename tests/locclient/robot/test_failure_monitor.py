@@ -127,7 +127,7 @@ def test_silence_is_a_failure_of_its_own() -> None:
     assert (never.kind, never.cause) == ("not_found", "no_frames")
     play(monitor, 0, 3, fix=True)
     failure = monitor.handle_silence(2.5)
-    assert (failure.cause, failure.duration_s, failure.image) == ("no_frames", 2.5, None)
+    assert (failure.cause, failure.duration_s) == ("no_frames", 2.5)
     assert monitor.handle_silence(3.0) is None
 
 

@@ -25,8 +25,8 @@ def robot_of(store: MapStore, site: str = "low", *, missing: bool = False) -> Ro
     floors, robot = BuildingMaps(source, lambda other: LocalMapSource(store.folder, other)), robot_world.new_robot()
     floors.refresh()
     change = floors.changes.popleft()
-    fetched = source.tiles(source.manifest(source.newest()))
-    robot.use(replace(robot_world.loaded(store, site=site), tiles=fetched.tiles))
+    tiles, _ = source.tiles(source.manifest(source.newest()))
+    robot.use(replace(robot_world.loaded(store, site=site), tiles=tiles))
     robot.use_building(change.building, [] if missing else change.maps)
     return robot
 

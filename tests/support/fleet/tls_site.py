@@ -13,7 +13,6 @@ import httpx
 import pytest
 
 from locclient.identity import RobotIdentity
-from locclient.maps.map_client import outbox_path
 
 START_S = 120.0  # on a machine that may be busy
 
@@ -100,7 +99,7 @@ class TlsSite:
         return path
 
     def spool(self, robot: str) -> Path:
-        return outbox_path(self.name, robot, self.folder / f"{robot}-cache" / "tiles")
+        return self.folder / f"{robot}-cache" / "spool" / f"{self.name}.{robot}.sqlite3"
 
     def failures(self, robot: str) -> Path:
         """The folder in which the daemon keeps the reports that it makes."""

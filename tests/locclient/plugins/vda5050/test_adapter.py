@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec import ValidationError, convert
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, so3_exp
@@ -19,7 +20,7 @@ from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient import hooks
 from locclient.plugins.vda5050.adapter import FleetAdapter
-from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
 from locclient.plugins.vda5050.localization import Localization, Position
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
@@ -85,7 +86,7 @@ class Adapter(FleetAdapter):
     def __init__(self, **settings: Any) -> None:
         self.now_s, self.offers, self.priors = 100.0, [], []
         self.schema = validator("state")
-        self.older = [(dialect(version), validator("state", version)) for version in ("2.0.0", "2.1.0")]
+        self.older = [(Dialect(version), validator("state", version)) for version in ("2.0.0", "2.1.0")]
         robot: Any = SimpleNamespace(
             site="hall", active=lambda: None, offer=self.offers.append, put_prior=self.priors.append, lost_radius_m=3.0
         )
@@ -264,7 +265,7 @@ def test_malformed_messages_are_said_and_change_nothing(name: str) -> None:
     adapter, payload = Adapter(), MALFORMED[name]
     for take in (adapter.instant_actions, adapter.order):
         take(payload)
-        adapter.instant_actions(dialect("2.1.0").heard(payload))
+        adapter.instant_actions(Dialect("2.1.0").heard(payload))
     assert adapter.error_types() == [*["VALIDATION_FAILURE"] * 3, "ROBOT_PART_MISSING"]
     assert adapter.said()["instantActionStates"] == []
     assert adapter.ask("stateRequest")["actionStatus"] == "FINISHED"
@@ -419,7 +420,7 @@ def _sheet() -> dict[str, Any]:
 def test_a_factsheet_is_completed(tmp_path: Path) -> None:
     path = tmp_path / "factsheet.json"
     path.write_text(json.dumps(_sheet()))
-    sheet = read_factsheet(path, dialect("3.0.0"))
+    sheet = read_factsheet(path, Dialect("3.0.0"))
     assert list(validator("factsheet").iter_errors({**HEADER, **sheet})) == []
     assert sheet["typeSpecification"]["localizationTypes"] == ["RFID", "NATURAL"]
     assert "downloadMap" in [action["actionType"] for action in sheet["protocolFeatures"]["mobileRobotActions"]]
@@ -432,7 +433,7 @@ def test_a_factsheet_is_completed(tmp_path: Path) -> None:
         change(spoiled)
         path.write_text(json.dumps(spoiled))
         with pytest.raises(UsageError, match="factsheet"):
-            read_factsheet(path, dialect("3.0.0"))
+            read_factsheet(path, Dialect("3.0.0"))
 
 
 @pytest.mark.parametrize(
@@ -443,14 +444,15 @@ def test_a_factsheet_is_completed(tmp_path: Path) -> None:
         ({"broker": "mqtts://x", "serial_number": "a/b"}, "serial_number"),
         ({"broker": "mqtts://x", "username": "u"}, "belong together"),
         ({"broker": "mqtts://x", "version": "2.0.0"}, "no actions on maps"),
-        ({"broker": "mqtts://x", "state_interval_s": 31.0}, "30 at most"),
-        ({"broker": "mqtts://x", "initial_sigma_m": 0.05}, "a dock's"),
+        ({"broker": "mqtts://x", "state_interval_s": 31.0}, "<= 30"),
+        ({"broker": "mqtts://x", "initial_sigma_m": 0.05}, ">= 0.15"),
         ({"broker": "mqtts://x", "username": "u", "password_file": "/nowhere"}, "cannot be read"),
     ],
 )
 def test_settings_that_cannot_be_right(settings: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        check_section(Vda5050Section(**{"manufacturer": "acme", "serial_number": "1", **settings}), insecure=False)
+    given = {"manufacturer": "acme", "serial_number": "1", **settings}
+    with pytest.raises((UsageError, ValidationError), match=words):
+        check_section(convert(given, Vda5050Section), insecure=False)
 
 
 def test_the_session_in_the_manual_is_one() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fleetmap.errors import UsageError
-from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, InstantActions, RobotPart, decode, timestamp
 from support.fleet_manager.vda5050_master import validator
@@ -49,7 +49,7 @@ def headed(version: str, content: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("version", OLD)
 def test_a_state_of_any_content_fits(version: str) -> None:
-    said = dialect(version).said("state", STATE)
+    said = Dialect(version).said("state", STATE)
     assert list(validator("state", version).iter_errors(headed(version, said))) == []
     assert said["agvPosition"]["positionInitialized"] is True
     assert said["operatingMode"] == "TEACHIN"
@@ -72,7 +72,7 @@ def test_every_mode_of_a_robot_fits(mode: str, stop: str) -> None:
         json.dumps({key: content[key] for key in ("operatingMode", "safetyState", "powerSupply")}).encode(), RobotPart
     )
     for version in OLD:
-        said = headed(version, dialect(version).said("state", content))
+        said = headed(version, Dialect(version).said("state", content))
         assert list(validator("state", version).iter_errors(said)) == []
 
 
@@ -82,7 +82,7 @@ def test_every_mode_of_a_robot_fits(mode: str, stop: str) -> None:
     ("visualization", {"referenceStateHeaderId": 3, "mobileRobotPosition": PLACE, "velocity": {"vx": 1.0}}),
 ])  # fmt: skip
 def test_other_topics_fit(version: str, topic: str, content: dict[str, Any]) -> None:
-    said = dialect(version).said(topic, content)
+    said = Dialect(version).said(topic, content)
     assert list(validator(topic, version).iter_errors(headed(version, said))) == []
     assert "referenceStateHeaderId" not in said
     assert said.get("connectionState", "CONNECTIONBROKEN") == "CONNECTIONBROKEN"
@@ -95,12 +95,12 @@ def test_instant_actions_of_all_versions_are_understood() -> None:
     for version, asked in by_version.items():
         message = headed(version, {"actions": [asked]})
         assert list(validator("instantActions", version).iter_errors(message)) == []
-        (heard,) = decode(dialect(version).heard(json.dumps(message).encode()), InstantActions).actions
+        (heard,) = decode(Dialect(version).heard(json.dumps(message).encode()), InstantActions).actions
         assert (heard.action_type, heard.action_id, heard.action_descriptor) == ("initializePosition", "a", "words")
         assert heard.action_parameters[0].key == "x"
         for optional in ("actionDescription", "actionParameters"):
             (heard,) = decode(
-                dialect(version).heard(json.dumps({"headerId": 1, "actions": [asked | {optional: None}]}).encode()),
+                Dialect(version).heard(json.dumps({"headerId": 1, "actions": [asked | {optional: None}]}).encode()),
                 InstantActions,
             ).actions
             assert (heard.action_type, heard.action_id) == ("initializePosition", "a")
@@ -113,14 +113,14 @@ def test_what_is_no_message_is_left_to_the_adapter(payload: bytes) -> None:
     from fleetmap.errors import LinkError
 
     with pytest.raises(LinkError):
-        decode(dialect("2.1.0").heard(payload), InstantActions)
+        decode(Dialect("2.1.0").heard(payload), InstantActions)
     with pytest.raises(LinkError, match="limit"):
-        decode(dialect("2.1.0").heard(b" " * (MAX_PAYLOAD_BYTES + 1)), InstantActions)
+        decode(Dialect("2.1.0").heard(b" " * (MAX_PAYLOAD_BYTES + 1)), InstantActions)
 
 
 @pytest.mark.parametrize("version", OLD)
 def test_a_factsheet_of_an_older_version_is_completed(version: str, tmp_path: Path) -> None:
-    path, spoken = tmp_path / "factsheet.json", dialect(version)
+    path, spoken = tmp_path / "factsheet.json", Dialect(version)
     sheet = {
         "typeSpecification": {
             "seriesName": "T", "agvKinematic": "DIFF", "agvClass": "TUGGER", "maxLoadMass": 500, "localizationTypes": ["RFID"],
