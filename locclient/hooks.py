@@ -12,7 +12,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fleetmap.config import Section
@@ -21,7 +20,6 @@ from fleetmap.mapformat.building import Floor
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.identity import MapAddress
-from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import ImagePriors, Outcome
 from locclient.robot.version_trial import VersionChange
 
@@ -32,6 +30,7 @@ if TYPE_CHECKING:
     from fleetmap.sensors.rectification import MountedCamera
     from fleetmap.sensors.source_settings import Topics
     from fleetmap.sources.intake import Intake
+    from locclient.maps.map_client import MapClient
     from locclient.outputs import OutputSection, Publisher
 
 
@@ -39,17 +38,13 @@ if TYPE_CHECKING:
 class LinkedRobot:
     """What a link may use of its robot. lost_radius_m: 95 % radius beyond which a pose is LOST.
 
-    cache, folder for files during download, and active, the robot's complete version: on the thread of `RobotLink.work`. check_admitted:
-    raises UntrustedError for versions outside the site's signed list; None without a map server. offer: passes a version to the localizer.
+    client: with the cache, on the thread of `RobotLink.work`; its `trust` is None without a map server. offer: passes a version to the
+    localizer.
     """
 
-    site: str
+    client: "MapClient"
     insecure: bool
     lost_radius_m: float
-    cache: TileCache
-    folder: Path
-    active: Callable[[], WantedVersion | None]
-    check_admitted: Callable[[WantedVersion], None] | None
     offer: Callable[[WantedVersion], None]
     put_prior: Callable[[PositionPrior], None]
 

@@ -130,7 +130,7 @@ def _opened_outbox(file: Path, max_bytes: int) -> Outbox:
     try:
         outbox.counts()
     except StoreError as error:
-        _log.error("failures are not kept: %s", error)
+        _log.error("failures or their recordings are not kept: %s", error)
     if outbox.set_aside is not None:
         _log.warning("the spool was damaged; it was moved to %s, and a new one was started", outbox.set_aside)
     return outbox
@@ -204,17 +204,8 @@ def _server(
     upkeep, retry_s = partial(_keep_certificate, address, bus), config.run.trial.retry_s
     server = ServerSync(client, outbox, retry_s=retry_s, upkeep=upkeep, put_prior=intake.put_prior)
     server.is_alone = address.server is None
-    robot = LinkedRobot(
-        site=address.site,
-        insecure=config.run.insecure,
-        lost_radius_m=config.localizer.track.lost_radius_m,
-        cache=cache,
-        folder=cache.folder / "incoming",
-        active=client.active,
-        check_admitted=None if server.is_alone else client.check_admitted,
-        offer=server.fetched.append,
-        put_prior=intake.put_prior,
-    )
+    lost_radius_m = config.localizer.track.lost_radius_m
+    robot = LinkedRobot(client, config.run.insecure, lost_radius_m, server.fetched.append, intake.put_prior)
     server.links = [hook.open(section, robot) for hook, section in links_of(config)]
     return server
 

@@ -30,15 +30,11 @@ class Kind(NamedTuple):
 
     dtype: str
     shape: tuple[int | str, ...]
-    is_good: Callable[[AnyArray, StereoCamera], bool]
+    is_good: Callable[[AnyArray, StereoCamera], bool] = lambda *_: True
 
 
 def _finite(values: AnyArray, _: StereoCamera) -> bool:
     return bool(np.isfinite(values).all())
-
-
-def _any(_: AnyArray, __: StereoCamera) -> bool:
-    return True
 
 
 def _rigid(target_from_source: AnyArray, _: StereoCamera) -> bool:
@@ -86,10 +82,10 @@ ARRAYS: Mapping[str, Kind] = {
     "Features.pixels": Kind("<f8", ("n", 2), _within),
     "Features.octaves": Kind("|i1", ("n",), lambda octaves, _: bool(np.all((octaves >= 0) & (octaves < 32)))),
     "Features.angles_deg": Kind("<f4", ("n",), _finite),
-    "Features.descriptors": Kind("|u1", ("n", 32), _any),
+    "Features.descriptors": Kind("|u1", ("n", 32)),
     "FrameFeatures.pixels": Kind("<f8", ("n", 3), _stereo_pixels),
     "clearance_px": Kind("|u1", ("h", "w"), lambda px, camera: px.shape == (camera.height_px, camera.width_px)),
-    "track_ids": Kind("<i8", (0,), _any),  # of the odometry; recordings do not keep its tracks
+    "track_ids": Kind("<i8", (0,)),  # of the odometry; recordings do not keep its tracks
 }
 
 
@@ -133,16 +129,7 @@ class _Walk:
         self._cameras, self._camera = cameras, cameras[0]
 
     def check(self, value: Any, where: str) -> None:
-        if isinstance(value, Section):
-            for name in value.__struct_fields__:
-                member, at = getattr(value, name), f"{where}.{name}"
-                is_number = isinstance(member, int | float) and name != "seed"
-                if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
-                    raise _refused(at, f"{member}")
-                if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
-                    raise _refused(at, f"{member}")
-                self.check(member, at)
-        elif (names := next((getattr(value, kind) for kind in _MEMBERS if hasattr(value, kind)), None)) is not None:
+        if (names := next((getattr(value, kind) for kind in _MEMBERS if hasattr(value, kind)), None)) is not None:
             self._members(value, names, where)
         elif isinstance(value, Mapping | list | tuple):
             if len(value) > MAX_ROWS:
@@ -166,6 +153,10 @@ class _Walk:
             self._camera = self._cameras[value.view]
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
+            if isinstance(value, Section) and isinstance(member, int | float) and name != "seed":
+                is_share = name.endswith("_share")  # by default all of them lie in between
+                if not (isfinite(member) and abs(member) <= _MAX_SETTING) or (is_share and not 0 < member < 1):
+                    raise _refused(at, f"{member}")
             if isinstance(member, np.ndarray):
                 self._array(member, ARRAYS.get(f"{type(value).__name__}.{name}") or ARRAYS.get(name), at, lengths)
             else:

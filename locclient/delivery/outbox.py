@@ -56,9 +56,9 @@ class Outbox:
             path.chmod(OWN_FILE)  # SQLite gives its other files the same
             try:
                 self._check()
-            except sqlite3.DatabaseError as error:
-                if isinstance(error, sqlite3.OperationalError):
-                    raise
+            except sqlite3.OperationalError:
+                raise
+            except sqlite3.DatabaseError:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:

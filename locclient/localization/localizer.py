@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Cause
 from fleetmap.odometry.estimate import is_away
@@ -12,7 +11,6 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
-from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate, assemble, map_cov
 from locclient.localization.held_maps import HeldMap, HeldMaps
 from locclient.localization.map_query import MapQuery
@@ -34,8 +32,7 @@ class Localizer:
         """clock: seconds, measures the stages; the default measures nothing."""
         self._rig, self._settings, self._clock = rig, settings, clock
         self.perception = Perception(rig, settings, clock)
-        self._mounting = Mounting(se3_inverse(rig.mounted[0].body_from_cam), rig.base_from_body)
-        self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, rig.imu_minus_cam_s)
+        self._calibration = CalibrationMonitor(rig, settings.relocalizer)
         self.maps = HeldMaps()
         self._tracker = PoseTracker(settings, rig.mounted, rig.base_from_body, self.maps)
         self._query = MapQuery(self._tracker, settings, len(rig.mounted))
@@ -162,4 +159,4 @@ class Localizer:
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self.maps.version_on(estimate.floor))
         fixed_ns = None if tracker.confirmed is None or percept.is_reversed else tracker.confirmed.stamp_ns
-        return with_calibration(estimate, self._mounting, fixed_ns, was_localized=tracker.was_tracking)
+        return with_calibration(estimate, self._rig, fixed_ns, was_localized=tracker.was_tracking)

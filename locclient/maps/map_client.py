@@ -129,7 +129,7 @@ class MapClient(MapSource):
     ) -> None:
         """patience_s: maximum interruption of a fetch. Raises UsageError for names that cannot be keys."""
         super().__init__(site)
-        self.bus, self._cache = bus, cache
+        self.bus, self.cache = bus, cache
         self.robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
         self.chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
@@ -166,7 +166,7 @@ class MapClient(MapSource):
 
     def active(self) -> WantedVersion | None:
         """Return the active version, complete in the cache; None before the first one."""
-        active = self._cache.active(self.site)
+        active = self.cache.active(self.site)
         return None if active is None else active.wanted(self.site)
 
     def ready(self) -> ReadyVersion:
@@ -224,7 +224,7 @@ class MapClient(MapSource):
         """
         self._begun = ""
         manifest = self.manifest(wanted)
-        self._cache.reserve(self.site, addresses_of(manifest, wanted.manifest_sha256 or ""))
+        self.cache.reserve(self.site, addresses_of(manifest, wanted.manifest_sha256 or ""))
         self.vocabulary(manifest)
         for entry in manifest.tiles:
             # Decode to validate, do not keep: a large site exceeds a robot's memory.
@@ -243,9 +243,9 @@ class MapClient(MapSource):
         """Make a fetched version the one that the robot starts with; StoreError if a piece of it is missing."""
         addresses = addresses_of(manifest, wanted.manifest_sha256 or "")
         with suppress(LinkError, MapFormatError):  # of a grid that is not complete in the cache
-            found = grid_blobs(manifest, CachedMap(self._cache, self.site).blob)
-            addresses += found if all(sha256 in self._cache for sha256 in found) else ()
-        self._cache.activate(self.site, manifest.version, addresses)
+            found = grid_blobs(manifest, CachedMap(self.cache, self.site).blob)
+            addresses += found if all(sha256 in self.cache for sha256 in found) else ()
+        self.cache.activate(self.site, manifest.version, addresses)
 
     # --- contents of a version ----------------------------------------------------------------------------------------
 
@@ -256,7 +256,7 @@ class MapClient(MapSource):
         MapFormatError for wrong bytes.
         """
         version, sha256 = address_of(wanted)
-        active = self._cache.active(self.site)
+        active = self.cache.active(self.site)
         is_active = active is not None and sha256 == active.blobs[0]
         max_bytes = MAX_MANIFEST_BYTES
         # By the signed list; the manifest defines all else of a version, by hash and size. An admitted fetch is completed even if the
@@ -271,14 +271,14 @@ class MapClient(MapSource):
         return self._blob(self._key(f"blobs/{sha256}"), sha256, max_bytes)
 
     def _is_at_hand(self, sha256: str) -> bool:
-        return sha256 in self._cache
+        return sha256 in self.cache
 
     def _blob(self, key: str, sha256: str, max_bytes: int) -> bytes:
         """Return the verified bytes of an address, from the cache or the server, and cache them."""
-        data = self._cache.get(sha256)
+        data = self.cache.get(sha256)
         if data is None:
             data = verified(self.chunks.read(key, max_bytes=max_bytes), sha256)
-            self._cache.put(sha256, data)
+            self.cache.put(sha256, data)
         return data
 
     # --- what a site keeps beside its versions ------------------------------------------------------------------------
@@ -288,14 +288,14 @@ class MapClient(MapSource):
 
         Errors as of `manifest`; the cached file stays.
         """
-        kept = self._cache.kept_file(self.site, kind)
+        kept = self.cache.kept_file(self.site, kind)
         named = None if self.trust is None else self.trust.files
         if named is None or (kept is not None and sha256_hex(kept) == named.get(kind)):
             return kept
         data = None
         if (sha256 := named.get(kind)) is not None:
             data = verified(self.chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
-        self._cache.keep_file(self.site, kind, data)
+        self.cache.keep_file(self.site, kind, data)
         return data
 
     # --- reports ------------------------------------------------------------------------------------------------------

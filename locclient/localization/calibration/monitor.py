@@ -9,14 +9,14 @@ from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, transport_cov, turn_both
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.relocalizer import is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.calibration.parameters import CalibrationState
-from locclient.localization.calibration.watch import CalibrationWatch, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch
 from locclient.localization.estimate import Estimate
 from locclient.localization.map_query import FinishedQuery
 
@@ -31,9 +31,9 @@ class CalibrationMonitor:
     """Runs the calibration watch for the localizer. Its work is spread over the frames after a query, except for the first confirmed
     pose: that is judged at once, before it is published."""
 
-    def __init__(self, rig: Mounting, settings: RelocalizerSettings, imu_minus_cam_s: float = 0.0) -> None:
+    def __init__(self, rig: MountedRig, settings: RelocalizerSettings) -> None:
         self._settings = settings
-        self.watch = CalibrationWatch(rig, settings.stereo, imu_minus_cam_s)
+        self.watch = CalibrationWatch(rig, settings.stereo)
         self._job: TimeSliced[None] | None = None
         self._searched_ns: int | None = None
         self._order, self._order_ns = PairOrder.UNKNOWN, -(2**62)
@@ -87,7 +87,7 @@ class CalibrationMonitor:
             self.watch.handle_unmatched(replace(query, fix=fixes[0], is_confirmed=False))
 
 
-def with_calibration(estimate: Estimate, rig: Mounting, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
+def with_calibration(estimate: Estimate, rig: MountedRig, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
     """Return the estimate by the state of its calibration: if wrong, not TRACKING and with a larger covariance; the covariance
     also grows if an error beyond the limit is not excluded.
 
@@ -106,11 +106,17 @@ def with_calibration(estimate: Estimate, rig: Mounting, last_fix_ns: int | None,
     return replace(estimate, status=status, map_from_body=None, cov_rot_trans=None)
 
 
-def _widened(estimate: Estimate, rig: Mounting) -> Estimate:
-    covariance, map_from_body, state = estimate.cov_rot_trans, estimate.map_from_body, estimate.calibration
-    if covariance is None or map_from_body is None or state.cov_bias_cam is None:
+def _widened(estimate: Estimate, rig: MountedRig) -> Estimate:
+    covariance, map_from_body, bias_cam = (
+        estimate.cov_rot_trans,
+        estimate.map_from_body,
+        estimate.calibration.cov_bias_cam,
+    )
+    if covariance is None or map_from_body is None or bias_cam is None:
         return estimate
-    added = state.cov_bias(map_from_body @ se3_inverse(rig.cam_from_body), map_from_body)
+    map_from_cam = map_from_body @ rig.mounted[0].body_from_cam
+    turn = turn_both(map_from_cam[:3, :3])
+    added = transport_cov(turn @ bias_cam @ turn.T, map_from_body[:3, 3] - map_from_cam[:3, 3])
     return replace(estimate, cov_rot_trans=covariance + added)
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, transport_cov, turn_both
+from fleetmap.geometry import Array
 
 DRIFT_SIGMAS = 5.0
 """Drift limit in sigmas of a parameter: p = 6e-7 for one test. Ten parameters and three windows, corrected by Bonferroni's inequality,
@@ -93,12 +93,6 @@ class CalibrationState(NamedTuple):
     @property
     def is_wrong(self) -> bool:
         return bool(self.text)
-
-    def cov_bias(self, map_from_cam: Array, map_from_body: Array) -> Array:
-        """Return the covariance (6, 6) that wrong parameters add to a pose: map axes, rotation first, about the body."""
-        assert self.cov_bias_cam is not None
-        turn = turn_both(map_from_cam[:3, :3])
-        return transport_cov(turn @ self.cov_bias_cam @ turn.T, map_from_body[:3, 3] - map_from_cam[:3, 3])
 
     @property
     def figures(self) -> dict[str, float | str]:

@@ -11,6 +11,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transport_cov
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
+from fleetmap.sensors.rectification import MountedRig
 from locclient.localization.calibration import mounting
 from locclient.localization.calibration.camera_view import camera_view, pair_offsets
 from locclient.localization.calibration.mounting import BasePose, WheelTravel
@@ -49,14 +50,6 @@ _JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the 
 
 
 @dataclass(frozen=True)
-class Mounting:
-    """Mounting of the camera: cam_from_body, base_from_body (4, 4)."""
-
-    cam_from_body: Array
-    base_from_body: Array
-
-
-@dataclass(frozen=True)
 class _Look:
     """Information and score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
 
@@ -76,9 +69,9 @@ class CalibrationWatch:
     Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
     """
 
-    def __init__(self, rig: Mounting, stereo_settings: StereoSettings, imu_minus_cam_s: float = 0.0) -> None:
-        """imu_minus_cam_s: time offset of the calibration."""
-        self._rig, self._stereo, self._imu_minus_cam_s = rig, stereo_settings, imu_minus_cam_s
+    def __init__(self, rig: MountedRig, stereo_settings: StereoSettings) -> None:
+        self._rig, self._stereo = rig, stereo_settings
+        self._cam_from_body = se3_inverse(rig.mounted[0].body_from_cam)
         self._looks: deque[_Look] = deque(maxlen=_WINDOW)
         self.wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
@@ -146,13 +139,13 @@ class CalibrationWatch:
         fix, odometry = query.fix, query.odometry
         assert fix is not None
         if odometry.inertial and self._has_stood:
-            jacobian, measured = mounting.tilt(fix, self._rig.cam_from_body, odometry)
+            jacobian, measured = mounting.tilt(fix, self._cam_from_body, odometry)
             at = np.r_[TILT, COUNT : COUNT + 2]
             information[np.ix_(at, at)] += jacobian.T @ jacobian
             score[at] += jacobian.T @ measured
         if not self.wheels.is_heard:
             return
-        map_from_base = fix.map_from_cam @ self._rig.cam_from_body @ se3_inverse(self._rig.base_from_body)
+        map_from_base = fix.map_from_cam @ self._cam_from_body @ se3_inverse(self._rig.base_from_body)
         covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
         base = BasePose(map_from_base, covariance, self.wheels.at(odometry.stamp_ns))
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
@@ -170,7 +163,7 @@ class CalibrationWatch:
         sigma = float(np.hypot(odometry.imu_minus_cam_sigma_s, TIME_OFFSET.least_sigma))
         if not np.isfinite(sigma):
             return []
-        value = odometry.imu_minus_cam_s - self._imu_minus_cam_s
+        value = odometry.imu_minus_cam_s - self._rig.imu_minus_cam_s
         return [Drift(TIME_OFFSET, value, sigma, 0.0, abs(value) > max(TIME_OFFSET.limit, DRIFT_SIGMAS * sigma))]
 
     # --- judgement ----------------------------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ class FleetAdapter:
     ) -> None:
         """maps: None if the map server selects the version."""
         self._section, self._maps, self._robot, self._clock_s = section, maps, robot, clock_s
-        self.map_id = section.map_id or robot.site
+        self.map_id = section.map_id or robot.client.site
         self.changed, self.factsheet_wanted = threading.Event(), threading.Event()
         self._lock = threading.RLock()
         self._book = ActionBook()
@@ -131,19 +131,19 @@ class FleetAdapter:
             given = parameters(action, self._section.robot_actions)
             self._book.accepted(action)
             if kind in MAP_ACTIONS:
-                return self._queue(action, given)
-            if kind == "initializePosition":
-                return self._initialize(action, given)
-            if kind == "clearInstantActions":
-                self._book.clear()
-            if kind == "factsheetRequest":
-                if self._section.factsheet is None:
-                    raise RefusedActionError("FACTSHEET_MISSING", "[vda5050] factsheet names no file on this robot")
-                self.factsheet_wanted.set()
-            self._book.set(action, "FINISHED")
+                self._queue(action, given)
+            elif kind == "initializePosition":
+                self._initialize(action, given)
+            elif kind == "factsheetRequest" and self._section.factsheet is None:
+                raise RefusedActionError("FACTSHEET_MISSING", "[vda5050] factsheet names no file on this robot")
+            else:
+                if kind == "clearInstantActions":
+                    self._book.clear()
+                if kind == "factsheetRequest":
+                    self.factsheet_wanted.set()
+                self._book.set(action, "FINISHED")
         except RefusedActionError as error:
             self._book.fail(action, error)
-        return None
 
     # --- maps ---------------------------------------------------------------------------------------------------------
 
@@ -162,7 +162,7 @@ class FleetAdapter:
     def work(self) -> None:
         """Execute one action on maps, which may take as long as a download; on the thread that owns the cache."""
         maps = self._maps
-        active = self._robot.active()
+        active = self._robot.client.active()
         versions = [] if active is None or active.version is None else [(active.version, True)]
         with self._lock:
             self._versions = versions if maps is None else maps.versions()
@@ -201,11 +201,11 @@ class FleetAdapter:
             wanted = maps.wanted(version)
             with self._lock:
                 self._enabling = (action, wanted, self._clock_s() + _ENABLE_S)
-            return self._robot.offer(wanted)
+            self._robot.offer(wanted)
+            return
         with self._lock:
             self._versions = maps.versions()  # before the action is finished, in any state
             self._book.set(action, "FINISHED")
-        return None
 
     def changed_version(self, change: VersionChange) -> None:
         """Handle a version that the localizer adopted, refused or postponed, after the change on the disk; on the thread of `work`."""
@@ -246,13 +246,13 @@ class FleetAdapter:
         self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
         if now.estimate.status is Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
-            return self._judge_position(is_last=True)
+            self._judge_position(is_last=True)
+            return
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
         covariance, soon_ns = np.diag(np.square(sigmas)), now.estimate.stamp_ns + 1
         self._robot.put_prior(PositionPrior(soon_ns, map_from_base, covariance, False, site))
-        return None
 
     def after_frame(
         self, outcome: Outcome, in_use: frozenset[int], building: Mapping[str, Floor], visited: Mapping[str, int]
@@ -298,13 +298,13 @@ class FleetAdapter:
                 self._last_node = parameters(action)["lastNodeId"], said_node
                 self._placing = None
                 self._book.set(action, "FINISHED")
-                return self.changed.set()
+                self.changed.set()
+                return
             words = f"the robot is localized {off_m:.2f} m and {off_rad:.2f} rad from there"
         if is_last or self._clock_s() > until_s:
             self._placing = None
             self._book.fail(action, RefusedActionError("INITIALIZE_POSITION_FAILED", words))
             self.changed.set()
-        return None
 
     # --- the state ----------------------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, UnreachableError, UsageError, disk_errors
 from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
-from locclient.hooks import LinkedRobot
+from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import addresses_of
 from locclient.maps.tile_cache import ActiveVersion
 from locclient.plugins.vda5050.actions import RefusedActionError
@@ -142,19 +142,18 @@ def _origin(parts: SplitResult) -> tuple[str, str, int] | None:
 class FleetMaps:
     """For the thread that owns the robot's cache. Without a map server it takes what the fleet manager names with its hash."""
 
-    def __init__(self, robot: LinkedRobot, origins: Origins) -> None:
+    def __init__(self, client: MapClient, origins: Origins) -> None:
         """Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
         origins.check()
-        self._cache, self._site, self._folder, self._origins = robot.cache, robot.site, robot.folder, origins
-        self._needs_hash, self._check_admitted = robot.check_admitted is None, robot.check_admitted or (lambda _: None)
-        active = robot.cache.active(robot.site)
+        self._client, self._cache, self._site, self._origins = client, client.cache, client.site, origins
+        self._folder, active = client.cache.folder / "incoming", client.cache.active(client.site)
         try:
-            with disk_errors(f"{robot.folder} cannot be used", "choose another cache"):
-                robot.folder.mkdir(parents=True, exist_ok=True)
-                for leftover in robot.folder.glob("*.fmex"):
+            with disk_errors(f"{self._folder} cannot be used", "choose another cache"):
+                self._folder.mkdir(parents=True, exist_ok=True)
+                for leftover in self._folder.glob("*.fmex"):
                     leftover.unlink()
-            if active is not None and active not in robot.cache.kept(robot.site):
-                robot.cache.keep(robot.site, active.version, active.blobs)
+            if active is not None and active not in self._cache.kept(self._site):
+                self._cache.keep(self._site, active.version, active.blobs)
         except StoreError as error:
             _log.warning("maps of the fleet manager cannot be downloaded: %s", error)
 
@@ -173,7 +172,7 @@ class FleetMaps:
         if version in dict(self.versions()):
             words = f"version {version} is on the robot already; delete it before another download"
             raise RefusedActionError("DUPLICATE_MAP", words)
-        if self._needs_hash and not sha256:
+        if self._client.trust is None and not sha256:
             raise LinkError("without a map server no signed list admits a file; send its SHA-256 as mapHash")
         room_bytes = self._cache.room_bytes() // _TOGETHER
         fault = disk_errors(f"{self._folder} cannot be written", "make space for the cache")
@@ -209,6 +208,10 @@ class FleetMaps:
         wanted = self._get(version).wanted(self._site)
         self._check_admitted(wanted)
         return wanted
+
+    def _check_admitted(self, wanted: WantedVersion) -> None:
+        if self._client.trust is not None:
+            self._client.check_admitted(wanted)
 
     def delete(self, version: int, in_use: set[int]) -> None:
         """Remove a version; StateError if it is enabled, in use or absent."""

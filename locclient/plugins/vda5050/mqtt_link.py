@@ -187,7 +187,7 @@ def open_link(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
     if section.versions == "fleet manager":
         token = None if section.download_token_file is None else read_secret(section.download_token_file)
         ca = None if section.download_ca is None else Path(section.download_ca)
-        maps = FleetMaps(robot, Origins(section.download_from, token, ca, robot.insecure))
+        maps = FleetMaps(robot.client, Origins(section.download_from, token, ca, robot.insecure))
     adapter = FleetAdapter(section, maps, robot)
     sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), Dialect(section.version))
     mqtt = MqttLink(check_section(section, insecure=robot.insecure), section, adapter, sheet)

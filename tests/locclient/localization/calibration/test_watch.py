@@ -14,16 +14,17 @@ from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
-from locclient.localization.calibration.watch import CalibrationWatch, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch
 from locclient.localization.estimate import Estimate
 from locclient.localization.map_query import FinishedQuery
 from support.fleet.estimates import estimate
 from support.worlds.pinhole_pair import seen_with
 
-RIG = Mounting(np.eye(4), np.eye(4))
+RIG = MountedRig(RigCalibration((), None, np.eye(4)), (MountedCamera(cast("Any", None), np.eye(4)),))
 NO_IMAGE = np.zeros((480, 640), np.uint8)
 LEVEL = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # map_from_cam of a camera that looks along the map's x
 
@@ -215,7 +216,7 @@ def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_wrong_time_is_reported_and_costs_nothing() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings(), imu_minus_cam_s=0.002)
+    watch = CalibrationWatch(RIG._replace(imu_minus_cam_s=0.002), StereoSettings())
     for number in range(4):
         query = look(number, parameters())
         odometry = replace(query.odometry, imu_minus_cam_s=0.022, imu_minus_cam_sigma_s=0.0005)

@@ -19,6 +19,7 @@ from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient import hooks
+from locclient.hooks import LinkedRobot
 from locclient.plugins.vda5050.adapter import FleetAdapter
 from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
@@ -87,9 +88,8 @@ class Adapter(FleetAdapter):
         self.now_s, self.offers, self.priors = 100.0, [], []
         self.schema = validator("state")
         self.older = [(Dialect(version), validator("state", version)) for version in ("2.0.0", "2.1.0")]
-        robot: Any = SimpleNamespace(
-            site="hall", active=lambda: None, offer=self.offers.append, put_prior=self.priors.append, lost_radius_m=3.0
-        )
+        client: Any = SimpleNamespace(site="hall", active=lambda: None)
+        robot = LinkedRobot(client, False, 3.0, self.offers.append, self.priors.append)
         super().__init__(Vda5050Section(**settings), FakeMaps(), robot, lambda: self.now_s)  # type: ignore[arg-type]
         self.work()
         self._see(seen())

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -63,11 +62,10 @@ class Robot:
         self.asked: list[WantedVersion] = []
         self.fault: FleetmapError | None = None
         self.cache = TileCache(folder / "cache", max_bytes=max_bytes)
-        self.folder = folder / "incoming"
-        how = {"cache": self.cache, "folder": self.folder, "check_admitted": self._check}
-        self.maps = FleetMaps(SimpleNamespace(site="lab", **how), Origins(allowed))  # type: ignore[arg-type]
+        self.folder, self.site, self.trust = self.cache.folder / "incoming", "lab", "signed lists"
+        self.maps = FleetMaps(self, Origins(allowed))  # type: ignore[arg-type]
 
-    def _check(self, wanted: WantedVersion) -> None:
+    def check_admitted(self, wanted: WantedVersion) -> None:
         self.asked.append(wanted)
         if self.fault is not None:
             raise self.fault
