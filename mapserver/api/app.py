@@ -8,7 +8,6 @@ doubles round.
 import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
 from functools import cache, partial
 from http import HTTPMethod
 from typing import Any
@@ -69,7 +68,7 @@ def create_app(
     )
     problems.install(app)
     operators = settings.guard.operators or Operators(store)
-    app.add_middleware(Guard, settings=replace(settings.guard, operators=operators))
+    app.add_middleware(Guard, settings=settings.guard._replace(operators=operators))
     app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
     app.state.served = p.Served(store, fleet, metrics, bus, settings, operators, set())

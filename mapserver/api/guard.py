@@ -5,11 +5,10 @@ With sign-in on, every request except those in `_OPEN` needs a scope; an unliste
 
 import logging
 import re
-from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote, urlsplit
 
 from anyio import to_thread
@@ -53,8 +52,7 @@ _FIXED = [
 ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GuardSettings:
+class GuardSettings(NamedTuple):
     """Settings of the guard.
 
     names: accepted host names, beside localhost and addresses. operators: accounts; None: those of the application's store.

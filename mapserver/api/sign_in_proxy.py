@@ -6,7 +6,7 @@ The proxy sends their name and groups in headers. These are accepted from the pr
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NamedTuple
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -28,8 +28,7 @@ class _Person(NamedTuple):
     seen_s: float
 
 
-@dataclass(frozen=True)
-class SignInProxy:
+class SignInProxy(NamedTuple):
     """Addresses of proxies, and the roles of their groups. UsageError for an invalid address."""
 
     addresses: frozenset[str]

@@ -58,14 +58,13 @@ class Services:
         return [Markup(panel(self, *of)) for panel in self.panels.get(place, ())]
 
 
-@dataclass(frozen=True, slots=True)
-class PageContext:
+class PageContext(NamedTuple):
     """The site that is shown; root: prefix of all addresses; zone: the browser's, None: the server's own."""
 
     root: str
     site: str
     zone: tzinfo | None = None
-    query: Mapping[str, str] = field(default_factory=dict)
+    query: Mapping[str, str] = MappingProxyType({})
 
     def moment(self, stamp_ns: int | None) -> str | None:
         """A stamp of the server's clock by the clock of whoever looks."""

@@ -5,10 +5,10 @@ Robots choose the stamps and places that they send: what lies far from the failu
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from datetime import tzinfo
 from itertools import groupby, pairwise
 from math import dist
+from typing import NamedTuple
 
 from fleetmap.failure_definition import is_blind, is_usable
 from fleetmap.failure_summary import Moment
@@ -28,8 +28,7 @@ _JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot
 _FARTHEST_M = 1e5
 
 
-@dataclass(frozen=True, slots=True)
-class FailureClock:
+class FailureClock(NamedTuple):
     """The robot's stamps by the clock of whoever looks. began_ns: the failure's beginning by the robot, happened_ns: by the server."""
 
     began_ns: int
@@ -46,8 +45,7 @@ class FailureClock:
         return f"{abs(off_s):.1f} s {'after' if off_s >= 0 else 'before'} the beginning"
 
 
-@dataclass(frozen=True, slots=True)
-class BlindTime:
+class BlindTime(NamedTuple):
     """When a robot had no position to rely upon. blind_s: all of it, in so many parts.
 
     before_ns: the last moment before, found_ns: the first one with such a position behind; None where the recording does not have them.
@@ -199,7 +197,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
     """What the template needs."""
     detail = services.maps.store.fleet.failure(number(failure, "failure") or 0)
     row, report, began_ns = detail.failure, detail.report, detail.report.stamp_ns
-    context = replace(context, site=row.site)  # whatever site the address names, or none
+    context = context._replace(site=row.site)  # whatever site the address names, or none
     moments = services.health.moments(row.number, began_ns)
     clock = FailureClock(began_ns, row.happened_ns, context.zone)
     recorded = pictures_near(detail.pictures, began_ns)

@@ -2,8 +2,8 @@
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import Moment, decode_summary
@@ -36,8 +36,7 @@ _TRENDS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SiteHealth:
+class SiteHealth(NamedTuple):
     """A site's figures. day: the last 24 h; days: rates of 24 h each, oldest first, the last ends now.
 
     robots: each one's figures of the last 24 h. trend: how day compares with the 7 days before, in words. areas: the last 7 days beside

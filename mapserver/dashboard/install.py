@@ -2,10 +2,9 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 from urllib.parse import parse_qsl
 
 from anyio import to_thread
@@ -42,8 +41,7 @@ Hear = Callable[[str, str, Callable[[str, bytes], None]], None]
 _MAX_ADDRESS = 300  # percent-encoded it must fit into the sign-in's body, beside name and password
 
 
-@dataclass(frozen=True, slots=True)
-class Host:
+class Host(NamedTuple):
     """A server for its parts, which add endpoints to `app`, pages to `console`, and messages of the bus; hear: None without a bus."""
 
     store: MapStore

@@ -4,8 +4,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from fleetmap.messages import Status
 from mapserver.dashboard.data import Kept
@@ -35,8 +34,7 @@ def words_of(status: str) -> tuple[str, str]:
     return STATUSES.get(status, (status.lower(), "warn"))
 
 
-@dataclass(frozen=True, slots=True)
-class LiveRobot:
+class LiveRobot(NamedTuple):
     """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one; heading: from x to y.
 
     metrics: figures of its last health report. calibration: what the map shows of its cameras, empty for a robot that does not report it.

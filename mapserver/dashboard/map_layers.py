@@ -5,7 +5,6 @@ Maps draw these by `static/map/index.js`; the field `kind` says how.
 
 import base64
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 
 import cv2
 import msgspec
@@ -86,12 +85,11 @@ class Mark(_Drawn, frozen=True):
 Item = Picture | Square | Outline | Line | Dots | Mark
 
 
-@dataclass(frozen=True, slots=True)
-class Layer:
+class Layer(msgspec.Struct, frozen=True):
     """Items that are shown or hidden together, by a name that people see."""
 
     name: str
-    items: Sequence[Item] = field(default_factory=list)
+    items: Sequence[Item] = ()
     shown: bool = True
 
 

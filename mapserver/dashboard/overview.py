@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 from fleetmap.errors import UsageError
@@ -102,7 +101,7 @@ def _floors(services: Services, context: PageContext) -> tuple[list[Choice], lis
         for floor, level in reversed(levels.items())
     ]
     homes = sorted({robot.status.site for robot in robots if robot.floor == site})
-    rows = (row for home in homes for row in _rows(services, replace(context, site=home)) if row[0].floor == site)
+    rows = (row for home in homes for row in _rows(services, context._replace(site=home)) if row[0].floor == site)
     about = "on this floor: it tells no position here"
     guests = [_listed(row) | {"name": f"{row[0].name} of {row[0].status.site}", "about": about} for row in rows]
     return floors, guests
@@ -257,7 +256,7 @@ def _figures(live: Sequence[LiveRobot], health: SiteHealth) -> list[Figure]:
 def _notices(services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]) -> list[Notice]:
     """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
     store, site, found = services.maps.store, context.site, list[Notice]()
-    context = replace(context, query={})  # what is so now is not shown in the time that was chosen on another page
+    context = context._replace(query={})  # what is so now is not shown in the time that was chosen on another page
 
     def told(tone: str, words: str, page: str, incident: Incident | None = None) -> None:
         found.append(Notice(tone, words, context.to(page), begun(page), incident))

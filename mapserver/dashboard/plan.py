@@ -1,8 +1,7 @@
 """The floor plan of a version: its landmarks and places from above as a picture, and its tiles. Pure."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,8 +24,7 @@ Box = tuple[float, float, float, float]
 """Low x, low y, high x, high y."""
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(NamedTuple):
     """box: in `map`, metres. png: transparent where nothing is. places: number of places.
 
     directions: viewing directions of each tile's places.

@@ -4,7 +4,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -93,7 +92,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     wanted = number(context.query.get("job"), "job")
     chosen = None if wanted is None else services.maps.store.job(wanted)
     if chosen is not None:
-        context = replace(context, site=chosen.site)  # whatever site the address names, or none
+        context = context._replace(site=chosen.site)  # whatever site the address names, or none
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
     if chosen is None:  # the last in which a recording was built or refused: a night in which all of them wait was none
         ended = (job for job in jobs if job.state != "running")

@@ -7,17 +7,16 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.util import find_spec
 from tempfile import TemporaryFile
+from typing import NamedTuple
 
 from fleetmap.errors import FleetmapError, StateError
 
 _NO_NETWORK = ("--map-current-user", "--net", "--")
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessLimits:
+class ProcessLimits(NamedTuple):
     """Of one process: address space, CPU time, wall time, size of each written file (output included), and open files."""
 
     memory_bytes: int = 4 << 30

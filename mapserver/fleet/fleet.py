@@ -5,9 +5,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -75,14 +75,13 @@ class RobotStatus:
     last_pose: dict[str, Any] | None
 
 
-@dataclass(slots=True)
-class _Robot:
+class _Robot(msgspec.Struct):
     version: int | None = None
     seen_ns: int = 0
-    report: dict[str, Any] = field(default_factory=dict)
+    report: dict[str, Any] = {}
     last_estimate: PoseMessage | None = None
-    skew: ClockSkew = field(default_factory=ClockSkew)
-    stream: Stream = field(default_factory=Stream)
+    skew: ClockSkew = msgspec.field(default_factory=ClockSkew)
+    stream: Stream = msgspec.field(default_factory=Stream)
     is_present: bool | None = None
     is_stored: bool = False
     copied_ns: int | None = None
@@ -100,8 +99,7 @@ class _Robot:
         return is_new
 
 
-@dataclass(frozen=True, slots=True)
-class _Assignment:
+class _Assignment(NamedTuple):
     """A site's current version, and its canary version."""
 
     current: WantedVersion

@@ -2,8 +2,8 @@
 
 import math
 import threading
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any
+from dataclasses import fields
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
@@ -52,11 +52,10 @@ class IngestSettings(Section, frozen=True):
         )
 
 
-@dataclass(slots=True)
-class Stream:
+class Stream(msgspec.Struct):
     """What is counted from of one robot's messages. For one thread at a time."""
 
-    health: HealthStream = field(default_factory=HealthStream)
+    health: HealthStream = msgspec.field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
     trace_map_m: tuple[float, float] | None = None
     rows_left: float = math.inf  # until it is first bounded by the rows of a day
@@ -64,8 +63,7 @@ class Stream:
     hour: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Grid:
+class _Grid(NamedTuple):
     """Tiles of one version."""
 
     size_m: float

@@ -5,7 +5,6 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,12 +26,11 @@ _LIMITS, _AT_ONCE, _ANSWER_WITHIN_S = ProcessLimits(memory_bytes=1 << 30, cpu_s=
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class _Upload:
+class _Upload(msgspec.Struct):
     id: str
     total_bytes: int
     heard_ns: int
-    data: bytearray = field(default_factory=bytearray)
+    data: bytearray = msgspec.field(default_factory=bytearray)
     judged: Future[FailureAck] | None = None
 
 

@@ -1,8 +1,7 @@
 """Trend of areas: failures of a time compared with those of a time before, per area. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import scipy
 
@@ -14,8 +13,7 @@ _UNKNOWN: Verdict = "too little driving to say"
 _ORDER: dict[Verdict, int] = {"worse": 0, "no clear change": 1, "better": 2, "too little driving to say": 3}
 
 
-@dataclass(frozen=True, slots=True)
-class AreaTrend:
+class AreaTrend(NamedTuple):
     """An area now and before. low, high: interval of the ratio of failure rates, now over before; high None if unbounded.
 
     localised_*: share of the driving time in which robots were localised, None if unknown.

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 PREFIX, SIGMA, DRIFTS = "calibration_", "_sigma", "calibration_drifts"
 PARAMETERS = {
@@ -22,8 +21,7 @@ PARAMETERS = {
 """Parameters by the name of their figure, with display names. Others sent by robots are left out."""
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationFigure:
+class CalibrationFigure(NamedTuple):
     """One parameter: its difference to the robot's calibration by the map, in the unit at the end of its name.
 
     name: a key of PARAMETERS. is_drifted: True if the robot reports a significant difference above the tolerance.

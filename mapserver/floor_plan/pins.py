@@ -6,8 +6,8 @@ y up (negative in the picture), as in Open-RMF's traffic editor.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _PIN = re.compile(rf"(.{{1,80}}?)=({_NUMBER}),({_NUMBER}):({_NUMBER}),({_NUMBER}
 _Complex = NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True)
-class Pin:
+class Pin(NamedTuple):
     """One point. drawing: right and down from the drawing's upper left corner, in its units."""
 
     name: str
@@ -37,8 +36,7 @@ class Pin:
     map_m: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(NamedTuple):
     """The map's pose. far_sigma_m: standard deviation at the map's furthest corner; is_checked: True if the pins could reveal a mirrored
     drawing or a wrong pin."""
 

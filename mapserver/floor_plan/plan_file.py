@@ -1,8 +1,8 @@
 """The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), checked before it is decoded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,8 +16,7 @@ MAX_PLAN_BYTES = 64 << 20
 MAX_PLAN_PIXELS = 100_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class PlanFile:
+class PlanFile(NamedTuple):
     """data: the file's bytes. grey (H, W)."""
 
     name: str

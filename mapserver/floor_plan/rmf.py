@@ -5,10 +5,9 @@ origin in the upper left corner of the reference level's. Source: the documented
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import cv2
 import msgspec
@@ -122,8 +121,7 @@ class _File(msgspec.Struct):
         return self.levels[name]
 
 
-@dataclass(frozen=True, slots=True)
-class RmfLevel:
+class RmfLevel(NamedTuple):
     """lifts: outlines (4, 2) of the cabins that open here, in the building. drawing: name of its picture, and `placed` what `_File.placed`
     returns for it. reference: the reference level's picture, with its scale."""
 

@@ -1,7 +1,7 @@
 """Polygons requested for a new survey, as stored for a site, and the covered share of one. Pure."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -53,15 +53,14 @@ class SurveyRequest:
         return float(np.mean(near_drives(inside, driven_map_m))) if len(inside) else 0.0
 
 
-@dataclass(slots=True)
-class SurveyCourse:
+class SurveyCourse(msgspec.Struct):
     """What became of a request: when it was made, driven by robots, and in use by a version; 0 if it was not yet."""
 
     id: str
     place: str = ""
     asked_ns: int = 0
     driven_ns: int = 0
-    robots: list[str] = field(default_factory=list)
+    robots: list[str] = []
     used_ns: int = 0
 
 

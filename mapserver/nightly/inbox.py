@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
+from typing import NamedTuple
 
 from fleetmap.errors import (
     FleetmapError,
@@ -53,8 +54,7 @@ _DAY_S = 86_400
 _FOR_READING = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
-@dataclass(frozen=True, slots=True)
-class Arrivals:
+class Arrivals(NamedTuple):
     """Complete recordings, by name; with the reason, incomplete ones, and entries that cannot be recordings.
 
     others: names of files that are not recordings. They stay in place.

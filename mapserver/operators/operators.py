@@ -7,9 +7,8 @@ Passwords are hashed by argon2 with the low-memory profile of RFC 9106, section 
 import hashlib
 import secrets
 import threading
-from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fleetmap.errors import StateError, UsageError
 from mapserver.fleet.rate_limit import RateLimit
@@ -33,8 +32,7 @@ _NOTES, _NOTE_EVERY_S = 60, 60  # refusals in the log, which is never pruned
 _LOOK_EVERY_S = 1
 
 
-@dataclass(frozen=True, slots=True)
-class SignIn:
+class SignIn(NamedTuple):
     """Result of a sign-in: the session's secret, or a refusal and the seconds until the next attempt."""
 
     session: str = ""
@@ -122,7 +120,7 @@ class Operators:
             self.note("sign-in refused", "wrong name or password", who)
             return SignIn(refusal="Wrong name or password.")
         session = secrets.token_urlsafe(32)
-        who, kept = replace(who, operator=name), {"life_ns": LIFE_S * 10**9, "idle_ns": IDLE_S * 10**9}
+        who, kept = who._replace(operator=name), {"life_ns": LIFE_S * 10**9, "idle_ns": IDLE_S * 10**9}
         self._store.operators.begin_session(_digest(session), who, **kept)
         return SignIn(session)
 

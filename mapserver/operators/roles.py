@@ -1,9 +1,8 @@
 """Roles and their rights."""
 
 import re
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fleetmap.errors import UsageError
 
@@ -41,8 +40,7 @@ SCOPES: dict[str, frozenset[Scope]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(NamedTuple):
     """Authenticated sender of a request, by session, token or proxy. proof: the hash of a session, empty if absent."""
 
     name: str

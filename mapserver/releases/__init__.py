@@ -9,7 +9,6 @@ published -> retired by `gc`, once there are enough newer ones; published or ret
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -200,7 +199,7 @@ def end_canary(
     """
     if promote:
         store.check_bytes(store.version(canary.site, canary.version))
-    who, tried = replace(actor, reason=outcome), canary.version
+    who, tried = actor._replace(reason=outcome), canary.version
     with _releasing(store, canary.site) as release:
         rows = release.rows
         if rows.canary is None or rows.canary.id != canary.id:
@@ -251,7 +250,7 @@ def _make_current(release: Release, version: int, kind: str, detail: str, actor:
         is_promoted = canary.version == version
         outcome = actor.reason if is_promoted and actor.reason else f"version {version} became current"
         release.end_canary("promoted" if is_promoted else "stopped", outcome)
-        ended, who = "canary_promoted" if is_promoted else "canary_stopped", replace(actor, reason=outcome)
+        ended, who = "canary_promoted" if is_promoted else "canary_stopped", actor._replace(reason=outcome)
         release.log(ended, f"version {canary.version}", canary.version, who)
     release.make_current(version)
     release.log(kind, detail, version, actor)

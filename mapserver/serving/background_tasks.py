@@ -66,7 +66,7 @@ def server_tasks(
 
 
 def alert_tasks(store: MapStore, fleet: Fleet, settings: AlertSettings, receiver: Any) -> list[BackgroundTask]:
-    """Return the task that ends incidents of alerts and tells a receiver of alerts and acts (`AlertHook` of `mapserver/hooks.py`)."""
+    """Return the task that ends incidents of alerts and tells a receiver of alerts and acts (`mapserver.alerts` in `hooks.py`)."""
     begun_s, last = time.monotonic(), max((act.id for act in acts_after(store, 0)), default=0)
 
     def look() -> None:

@@ -62,7 +62,7 @@ class Transaction:
     def log(self, site: str, kind: str, detail: str, version: int | None = None, actor: Actor = NOBODY) -> None:
         """Write a line of the log, chained to the previous one; site: empty if not about one."""
         number, before = self.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone() or (0, "")
-        texts = [text.replace("\0", NUL) for text in (site, kind, detail, *astuple(actor))]
+        texts = [text.replace("\0", NUL) for text in (site, kind, detail, *actor)]
         values = (number + 1, self._database.now_ns(), *texts[:3], version, *texts[3:])
         row = dict(zip(AuditLine.__dataclass_fields__, (*values, _line_sha256(before, values)), strict=True))
         self.insert("events", [row])

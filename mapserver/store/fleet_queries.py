@@ -1,7 +1,7 @@
 """The fleet's health in the store: sums by the hour, thinned traces, failures with their pictures."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from itertools import accumulate
 from typing import Any
 
@@ -46,13 +46,12 @@ _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "ve
 _NO_FAILURE = "failure {} does not exist; the list of failures shows the stored ones"
 
 
-@dataclass(slots=True)
-class FleetBatch:
+class FleetBatch(msgspec.Struct):
     """Data since the last batch."""
 
-    counters: dict[CounterKey, Counters] = field(default_factory=dict)
-    traces: list[TraceRow] = field(default_factory=list)
-    last_reports: LastReports = field(default_factory=dict)
+    counters: dict[CounterKey, Counters] = {}
+    traces: list[TraceRow] = []
+    last_reports: LastReports = {}
 
     def add(self, site: str, axis: str, key: str, hour: int, counts: Counters) -> None:
         self.counters.setdefault((site, axis, key, hour), Counters()).add(counts)

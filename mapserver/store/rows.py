@@ -1,8 +1,8 @@
 """Records of a store. Most are rows of a table that `schema` makes of their fields."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -69,8 +69,7 @@ class RobotInfo:
     last_report: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Actor:
+class Actor(NamedTuple):
     """Author of a change, and reason; empty for automatic changes.
 
     operator: the name authenticated by a session or token, empty if `name` was only typed; address: of the request.
@@ -145,8 +144,7 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
     report: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DraftContent:
+class DraftContent(NamedTuple):
     """A new draft. archive: the whole survey; extras: bytes that localization does not need, by kind in `EXTRA_TABLES`; evidence: for the
     gate. job: number of the job that built it.
     """
@@ -198,8 +196,7 @@ class PictureRow:
     bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class FailureDetail:
+class FailureDetail(NamedTuple):
     """A failure with its context. report: without pictures; pictures: those still stored."""
 
     failure: FailureRow
@@ -207,8 +204,7 @@ class FailureDetail:
     pictures: list[PictureRow]
 
 
-@dataclass(frozen=True, slots=True)
-class FailureReplay:
+class FailureReplay(NamedTuple):
     """A failure's recording: its summary, the MCAP file, and stamps and JPEG files of its left pictures."""
 
     summary: bytes
@@ -288,8 +284,7 @@ class OperatorRow:
     sessions: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class SessionRow:
+class SessionRow(NamedTuple):
     """A session, with the present role of its operator."""
 
     name: str
@@ -309,8 +304,7 @@ class TokenRow:
     sha256: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class SiteReleases:
+class SiteReleases(NamedTuple):
     """State of a site's releases: its versions by number, and the running canary, if any.
 
     rollback_target: the previous current version, None if absent. files: addresses of the site's files for robots, by kind.
@@ -320,7 +314,7 @@ class SiteReleases:
     versions: dict[int, VersionInfo]
     rollback_target: int | None
     canary: CanaryRow | None
-    files: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str]
 
     @property
     def current(self) -> VersionInfo | None:
@@ -328,8 +322,7 @@ class SiteReleases:
         return next((info for info in self.versions.values() if info.state == "current"), None)
 
 
-@dataclass(frozen=True, slots=True)
-class Retention:
+class Retention(NamedTuple):
     """Retention rules of versions. keep_versions, keep_drafts: the newest of each site, besides protected ones.
 
     keep_days: time for which a retired version or superfluous draft is kept; robot_days: time for which a silent robot counts as

@@ -1,9 +1,10 @@
 """Garbage collection and verification of a store: every hash, every reference, the database itself."""
 
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.manifest import Manifest, decode_manifest
@@ -17,18 +18,16 @@ from mapserver.store.rows import Actor, Retention, SiteReleases, VersionInfo
 _DAY_NS = 86_400_000_000_000
 
 
-@dataclass(slots=True)
-class Garbage:
+class Garbage(msgspec.Struct):
     """Result, real or of a dry run: (site, version) retired and removed, files and bytes freed."""
 
-    retired: list[tuple[str, int]] = field(default_factory=list)
-    removed: list[tuple[str, int]] = field(default_factory=list)
+    retired: list[tuple[str, int]] = []
+    removed: list[tuple[str, int]] = []
     files: int = 0
     freed_bytes: int = 0
 
 
-@dataclass(slots=True)
-class StoreFindings:
+class StoreFindings(msgspec.Struct):
     """Result of a verification. faults: each a sentence, empty for an intact store.
 
     orphans and leftovers: unreferenced files, as left by a killed process; `gc` removes them. open_to_others: True if
@@ -42,7 +41,7 @@ class StoreFindings:
     orphans: int = 0
     leftovers: int = 0
     open_to_others: int = 0
-    faults: list[str] = field(default_factory=list)
+    faults: list[str] = []
 
 
 def collect(database: Database, blobs: Blobs, retention: Retention, actor: Actor | None) -> Garbage:

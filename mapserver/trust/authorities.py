@@ -10,9 +10,9 @@ A robot's certificate cannot be used as the server's: another authority signed i
 import ipaddress
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -35,8 +35,7 @@ _PEM = s.Encoding.PEM
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Authority:
+class Authority(NamedTuple):
     """A certificate authority."""
 
     key: ec.EllipticCurvePrivateKey

@@ -1,6 +1,6 @@
 """State of the signed lists: keys, expiry, and keys exposed to a thief of the server."""
 
-from dataclasses import dataclass, field
+import msgspec
 
 from fleetmap.errors import StateError
 from fleetmap.trust.site_list import site_role
@@ -15,8 +15,7 @@ _SITE_ENDS_SOON = 7
 _CERTIFICATE_ENDS_SOON = 30
 
 
-@dataclass(frozen=True)
-class RoleStatus:
+class RoleStatus(msgspec.Struct, frozen=True):
     """One role. number: of its newest file, 0 if absent."""
 
     role: str
@@ -26,8 +25,7 @@ class RoleStatus:
     fault: str = ""
 
 
-@dataclass(frozen=True)
-class CertificateStatus:
+class CertificateStatus(msgspec.Struct, frozen=True):
     """One certificate of the bus, by its file."""
 
     file: str
@@ -35,16 +33,15 @@ class CertificateStatus:
     fault: str = ""
 
 
-@dataclass
-class TrustStatus:
+class TrustStatus(msgspec.Struct):
     """All roles and certificates. faults: reasons why robots cannot get new maps, now or soon; risks: actions possible for a
     thief of this machine.
     """
 
-    roles: list[RoleStatus] = field(default_factory=list)
-    certificates: list[CertificateStatus] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)
-    risks: list[str] = field(default_factory=list)
+    roles: list[RoleStatus] = []
+    certificates: list[CertificateStatus] = []
+    faults: list[str] = []
+    risks: list[str] = []
 
 
 def trust_status(store: MapStore) -> TrustStatus:

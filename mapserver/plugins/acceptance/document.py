@@ -1,9 +1,8 @@
 """The report as a page that prints as a document to sign."""
 
 from base64 import b64encode
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +18,7 @@ _WIDTH, _HEIGHT = 660.0, 560.0  # of the drawing; text is 11 high
 _BARS_M = (1, 2, 5, 10, 20, 50, 100, 200)
 
 
-@dataclass(frozen=True)
-class SitePlan:
+class SitePlan(NamedTuple):
     """What is drawn: the map from above, areas, starts without a guess (x, y in `map`) by outcome, drives to add by place and heading."""
 
     seen: Plan

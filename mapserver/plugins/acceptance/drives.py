@@ -60,8 +60,7 @@ class ReplayReport(msgspec.Struct, frozen=True):
     starts: list[list[StartFrame]] = []
 
 
-@dataclass(frozen=True)
-class MapUnderTest:
+class MapUnderTest(NamedTuple):
     """A version of a site. built: what its archive knows, None for a version without one."""
 
     store: Path
@@ -102,8 +101,7 @@ class Picture:
         return self.error_m is not None and not self.is_wrong
 
 
-@dataclass(frozen=True)
-class Drive:
+class Drive(NamedTuple):
     """An examined drive."""
 
     figures: DriveFigures

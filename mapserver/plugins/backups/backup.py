@@ -10,9 +10,9 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import pyrage
 
 from fleetmap.errors import StateError, UsageError, disk_errors
@@ -27,8 +27,7 @@ _LEFT_OVER = ".backup-"
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, slots=True)
-class BackupReport:
+class BackupReport(msgspec.Struct, frozen=True):
     """Result of a backup. uploaded: objects that the target did not have. missing: blobs that the store itself has lost or damaged.
 
     removed: snapshots beyond the kept ones.

@@ -6,10 +6,10 @@ import shutil
 import tarfile
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import pyrage
 
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError, disk_errors
@@ -32,8 +32,7 @@ _LISTS_AHEAD = 100_000  # the same, of a timestamp each six hours and with each 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class RestoreReport:
+class RestoreReport(msgspec.Struct, frozen=True):
     """Result of a restoration. keys: names of the restored ones. robots: enrolled ones; people: operators, and programs with a token.
 
     lists: "none" without signed ones; "new": signed by new keys, all robots accept them; "ahead": robots accept them unless sites or keys
@@ -50,14 +49,13 @@ class RestoreReport:
     missing: tuple[str, ...]
 
 
-@dataclass(slots=True)
-class BackupFindings:
+class BackupFindings(msgspec.Struct):
     """Result of a verification of all snapshots. faults: each a sentence."""
 
     snapshots: int = 0
     objects: int = 0
     bytes: int = 0
-    faults: list[str] = field(default_factory=list)
+    faults: list[str] = []
 
 
 def identities_of(path: Path | None) -> "list[pyrage.x25519.Identity]":

@@ -3,9 +3,9 @@
 Files are untrusted: their size is checked before they are read, and nothing is unpickled.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ _UNIT_WITHIN = 0.01
 _EXPECTED = "TUM or KITTI text, or DROID's poses.npy, is expected"
 
 
-@dataclass(frozen=True, slots=True)
-class WrittenPoses:
+class WrittenPoses(NamedTuple):
     """N poses of a file; kind: TUM, KITTI or DROID.
 
     stamps_ns (N,): 10^9 times the written number, seconds or frame numbers; None if each frame has one row.

@@ -7,6 +7,7 @@ direction, or are unrelated; their errors are then as large as the motion itself
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,8 +147,7 @@ class GivenTrajectory:
         return GivenPoses(Trajectory(stamps_ns, at_frames), words)
 
 
-@dataclass(frozen=True, slots=True)
-class PoseReading:
+class PoseReading(NamedTuple):
     """A convention of poses: their frame, and the inversions needed to read the file that way."""
 
     frame: str
@@ -166,8 +166,7 @@ class PoseReading:
         return " and ".join(steps)
 
 
-@dataclass(frozen=True)
-class OwnMotion:
+class OwnMotion(NamedTuple):
     """Motion of the recording: stamps_ns (F,), frame_from_body (F, 4, 4), and the number of the connected piece (F,) of each frame,
     -1 if lost; and the mount of the camera.
     """
@@ -182,8 +181,7 @@ class OwnMotion:
         return self.body_from_cam if reading.frame == "camera" else np.eye(4)
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(NamedTuple):
     """A reading against the recording: metres in the file's unit of length and sigma of their logarithm, relative errors (P,) of
     stretches, medians of those of rotations and translations (None with fewer than LEAST_STRETCHES informative ones).
     """

@@ -294,7 +294,7 @@ class LiveMap:
         motions_body = turned(state.motion.motions, level_from_body[:, :3, :3].transpose(0, 2, 1))
         for n in np.flatnonzero(free).tolist():
             self._chain_from_body[first + n] = chain_from_level @ level_from_body[n]
-            self._news[first + n] = replace(self._news[first + n], motion_body=motions_body[n])
+            self._news[first + n] = self._news[first + n]._replace(motion_body=motions_body[n])
         self._keep_points(first, state, keep)
 
     def _keep_points(self, first: int, state: SurveyState, keep: NDArray[np.bool_]) -> None:

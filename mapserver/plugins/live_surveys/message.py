@@ -1,8 +1,7 @@
 """Message of a running survey with its key on the bus, and the values exchanged between tracking, the growing map and its viewers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
@@ -152,8 +151,7 @@ def live_key(site: str) -> str:
     return f"fleetmap/{site}/live/survey"
 
 
-@dataclass(frozen=True, slots=True)
-class NewKeyframe:
+class NewKeyframe(NamedTuple):
     """A frame chosen by the odometry.
 
     frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) makes that upright by the present gravity estimate.
@@ -168,7 +166,7 @@ class NewKeyframe:
     step_cov: Array | None
     motion_body: Array
     inertial: bool = False
-    imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    imu: ImuSamples = ImuSamples.empty()
     variance_m2: float = 0.0
 
 

@@ -9,11 +9,12 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from msgspec import Struct, structs
 from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
@@ -41,8 +42,7 @@ _ENDED = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class NightRequest:
+class NightRequest(NamedTuple):
     """Options of `mapserver nightly`. now_ns: the time against which `settle_s` is checked; retention: applied before the work."""
 
     site: str
@@ -50,12 +50,11 @@ class NightRequest:
     store: Path
     now_ns: int
     settle_s: float = 300.0
-    options: BuildOptions = field(default_factory=BuildOptions)
-    retention: FleetRetention = field(default_factory=FleetRetention)
+    options: BuildOptions = BuildOptions()
+    retention: FleetRetention = FleetRetention()
 
 
-@dataclass
-class NightReport:
+class NightReport(Struct):
     """The report of a night, with the keys of docs/reports.md. version: the current one at the end.
 
     expired: by kind, how much was removed after its period. looking_at: names of the recordings being read or built.
@@ -63,15 +62,15 @@ class NightReport:
     """
 
     job: int
-    resumes: list[int] = field(default_factory=list)
+    resumes: list[int] = []
     version: int | None = None
-    published: list[int] = field(default_factory=list)
-    recordings: list[dict[str, Any]] = field(default_factory=list)
-    waiting: list[dict[str, str]] = field(default_factory=list)
-    expired: dict[str, int] = field(default_factory=dict)
-    builds: list[dict[str, Any]] = field(default_factory=list)
-    looking_at: list[str] = field(default_factory=list)
-    ended: dict[str, float] = field(default_factory=dict)
+    published: list[int] = []
+    recordings: list[dict[str, Any]] = []
+    waiting: list[dict[str, str]] = []
+    expired: dict[str, int] = {}
+    builds: list[dict[str, Any]] = []
+    looking_at: list[str] = []
+    ended: dict[str, float] = {}
 
 
 def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
@@ -92,7 +91,7 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
                 share = 1.0 if len(job.report["looking_at"]) == 1 else _ENDED_TOGETHER
                 report.ended[name] = report.ended.get(name, 0) + share
             report.resumes += [job.id, *job.report.get("resumes", [])]
-        maps.update_job(report.job, "running", "", asdict(report))
+        maps.update_job(report.job, "running", "", structs.asdict(report))
         for job in killed:
             left = {key: value for key, value in job.report.items() if key != INTERRUPTED}
             maps.update_job(job.id, "failed", f"was interrupted; job {report.job} goes on with it", left)
@@ -110,10 +109,10 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
             with suppress(StoreError):  # disk full: the next night finds this job running, and ends it
                 report.version = _current(maps, site)
                 kept = "" if report.version is None else f"; version {report.version} stays current"
-                maps.update_job(report.job, "failed", f"{error}{kept}", asdict(report))
+                maps.update_job(report.job, "failed", f"{error}{kept}", structs.asdict(report))
             raise
         report.version = _current(maps, site)
-        maps.update_job(report.job, "done", sentence, asdict(report))
+        maps.update_job(report.job, "done", sentence, structs.asdict(report))
         return sentence
 
 

@@ -6,9 +6,9 @@ As a program with the arguments RECORDING CALIBRATION TOPICS it prints what `rea
 import os
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -25,8 +25,7 @@ _LEAST_MEMORY_BYTES, _OPEN_FILES = 4 << 30, 1024
 _MOST_ISSUES = 5
 
 
-@dataclass(frozen=True, slots=True)
-class InboxRecording:
+class InboxRecording(NamedTuple):
     """A readable recording; found: gaps reported by its reader, as text."""
 
     path: Path

@@ -1,7 +1,7 @@
 """All errors of an estimated trajectory against the truth, at the estimate's stamps, and its covariances. Both are of the same body."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from mapserver.evaluation.trajectory_error import absolute_trajectory_error, pai
 _ROWS, _COLUMNS = np.triu_indices(6)
 
 
-@dataclass(frozen=True, slots=True)
-class StampedCovariances:
+class StampedCovariances(NamedTuple):
     """stamps_ns (N,) rising, covs_rot_trans (N, 6, 6)."""
 
     stamps_ns: Stamps

@@ -99,7 +99,7 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
     told = one_way(plan, Areas())
     tiles = [f"tile {found.tile[0]},{found.tile[1]}" for found in plan.directions]
     assert [words.partition(", surveyed facing E: ")[0] for words in told] == tiles
-    both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
+    both = plan._replace(directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
     assert one_way(both, Areas()) == []
 
 

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,8 +21,8 @@ def run(program: str, limits: ProcessLimits = LIMITS) -> "subprocess.CompletedPr
 @pytest.mark.parametrize(
     ("program", "limits"),
     [
-        ("while True: pass", replace(LIMITS, cpu_s=1)),
-        ("import time; time.sleep(60)", replace(LIMITS, wall_s=0.5)),
+        ("while True: pass", LIMITS._replace(cpu_s=1)),
+        ("import time; time.sleep(60)", LIMITS._replace(wall_s=0.5)),
         ("import os; os.kill(os.getpid(), 11)", LIMITS),
     ],
     ids=["processor time", "time", "a fault of its own"],

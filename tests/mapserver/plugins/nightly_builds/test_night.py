@@ -586,7 +586,7 @@ def test_the_command_says_how_it_ended(
 
 def test_its_report_is_documented() -> None:
     documented = {code_words(row[0])[0] for row in rows(section("docs/reports.md", "Nightly"))}
-    assert documented == NightReport.__dataclass_fields__.keys() | {"state", "message"}
+    assert documented == {*NightReport.__struct_fields__} | {"state", "message"}
 
 
 def test_a_build_ends_with_its_killed_server(tmp_path: Path) -> None:
