@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.common import estimator_loop
-from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
@@ -25,7 +24,8 @@ from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession
-from support.recordings.painted_room import FRAME_NS, IMU_NS, Ride, frame_at, rig
+from support.recordings.painted_room import frame_of_both, measured, rig, standing_first
+from support.recordings.recording_samples import FRAME_NS, IMU_NS
 
 LAYOUT = Layout(aisles=2, bays=4)
 WEST_M, EAST_M, Y_M = 4.5, 8.5, LAYOUT.aisle_y_m(0)
@@ -86,39 +86,24 @@ def test_with_the_front_covered_all_along_the_rear_view_localises_it(rig: str) -
 
 # ------------------------------------------------------------------------------------------------------------- pictures
 
-_REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
-
-
-def rig_of_two(sensors: SensorSet) -> RigCalibration:
-    front = rig(sensors)
-    rear = [replace(c, body_from_cam=_REAR @ c.body_from_cam) for c in front.cameras]
-    return replace(front, cameras=(*front.cameras, *rear))
-
-
-class TurnedRide(Ride):
-    """The same ride as the rear pair sees it."""
-
-    def map_from_body(self, time_s: float) -> np.ndarray:  # type: ignore[type-arg]
-        return super().map_from_body(time_s) @ _REAR
+RIDE = standing_first()
 
 
 @lru_cache(maxsize=200)
 def seen_at(stamp_ns: int) -> CameraFrame:
-    front, rear = (frame_at(ride, stamp_ns, SensorSet.STEREO) for ride in (Ride(), TurnedRide()))
-    return replace(front, others=(rear,))
+    return frame_of_both(RIDE, stamp_ns)
 
 
-def imu_between(start_ns: int, end_ns: int) -> ImuSamples:
-    since_ns = np.arange(start_ns, end_ns, IMU_NS, dtype=np.int64)
-    rates, _, forces = (np.array(v) for v in zip(*(Ride().motion(s * 1e-9) for s in since_ns), strict=True))
-    return ImuSamples(1_000_000_000 + since_ns, rates, forces)
+def imu_until(stamp_ns: int) -> ImuSamples:
+    """Since the frame before."""
+    return measured(RIDE, stamp_ns - FRAME_NS, stamp_ns + IMU_NS)[0]
 
 
 @pytest.mark.parametrize("sensors", [SensorSet.STEREO, SensorSet.STEREO_INERTIAL])
 @pytest.mark.parametrize("fault", ["covered", "frozen", "dead"])
 def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: SensorSet, fault: str) -> None:
     """Of the front pair from 2 to 3.2 s and of the rear pair from 3.4 s on: no frame is lost, and the way is as accurate as before."""
-    calibration = rig_of_two(sensors)
+    calibration = rig(sensors, has_rear=True)
     rectifier = Rectifier(calibration)
     localizer = Localizer(rectifier.rig, LocalizerSettings())
     moved, views_of, last = np.eye(4), [], None
@@ -130,14 +115,14 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
             frame = spoilt(frame, fault, is_rear=time_s > 3.3, last=last)
         last = frame
         if sensors is SensorSet.STEREO_INERTIAL:
-            localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+            localizer.handle_imu(imu_until(stamp_ns))
         estimate = localizer.handle_stereo(rectifier.rectify(frame))
         odometry = estimate.odometry
         assert odometry.status is not OdometryStatus.DEGRADED, time_s
         if odometry.previous_from_body is not None:
             moved = moved @ odometry.previous_from_body
         views_of.append(estimate.view_causes)
-    truth = se3_inverse(Ride().map_from_body(0.0)) @ Ride().map_from_body(4.45)
+    truth = se3_inverse(RIDE(0.0)) @ RIDE(4.45)
     assert np.linalg.norm((moved - truth)[:3, 3]) < 0.03
     front, rear = ([views[k] is not Cause.NONE for views in views_of] for k in (0, 1))
     assert np.flatnonzero(front).tolist() == [*range(40, 64)]
@@ -149,7 +134,7 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
 )
 def test_a_pair_takes_over_from_a_single_camera(sensors: str, covered_s: float) -> None:
     """Before the scale is known, which wheels give, or the IMU once rest has shown gravity; or after, when rear disparities count."""
-    pairs, places = rig_of_two(SensorSet(sensors)), []
+    pairs, places = rig(SensorSet(sensors), has_rear=True), []
     rectifier = Rectifier(replace(pairs, cameras=(pairs.cameras[0], *pairs.cameras[2:])))
     localizer = Localizer(rectifier.rig, LocalizerSettings())
     with patch.object(InertialMode, "process", autospec=True, side_effect=InertialMode.process) as process:
@@ -157,9 +142,8 @@ def test_a_pair_takes_over_from_a_single_camera(sensors: str, covered_s: float) 
             frame = replace(with_noise(seen_at(stamp_ns), np.random.default_rng(stamp_ns)), right=None)
             if stamp_ns * 1e-9 > covered_s:
                 frame = spoilt(frame, "covered", is_rear=False, last=frame)
-            rates, velocity_mps, _ = Ride().motion(stamp_ns * 1e-9)
-            localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
-            localizer.handle_wheel([WheelSample(frame.stamp_ns, velocity_mps, float(rates[2]), 0.05, 0.02)])
+            localizer.handle_imu(imu_until(stamp_ns))
+            localizer.handle_wheel([measured(RIDE, stamp_ns, stamp_ns + IMU_NS)[1]])
             odometry = localizer.handle_stereo(rectifier.rectify(frame)).odometry
             places.append((stamp_ns, odometry.odom_from_body))
     assert localizer.perception.view == 1
@@ -167,14 +151,14 @@ def test_a_pair_takes_over_from_a_single_camera(sensors: str, covered_s: float) 
     assert odometry.scale_known
     assert odometry.status is OdometryStatus.TRACKING
     moved = se3_inverse(at(places, 1_250_000_000)) @ odometry.odom_from_body
-    truth = se3_inverse(Ride().map_from_body(1.25)) @ Ride().map_from_body(stamp_ns * 1e-9)
+    truth = se3_inverse(RIDE(1.25)) @ RIDE(stamp_ns * 1e-9)
     assert np.linalg.norm((moved - truth)[:3, 3]) < 0.05
 
 
 @pytest.mark.parametrize("front", ["covered pair", "single camera"])
 def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> None:
     """In front a pair that is covered all along while the rear pair has half the rate; or one camera, covered until the rear pair dies."""
-    calibration, is_single = rig_of_two(SensorSet.STEREO_INERTIAL), front == "single camera"
+    calibration, is_single = rig(SensorSet.STEREO_INERTIAL, has_rear=True), front == "single camera"
     calibration = replace(calibration, cameras=calibration.cameras[is_single and 1 :])
     rectifier = Rectifier(calibration)
     localizer = Localizer(rectifier.rig, LocalizerSettings())
@@ -190,7 +174,7 @@ def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> N
             )
         if is_dead or (number % 2 and not is_single):
             frame = replace(frame, others=(None,))
-        localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+        localizer.handle_imu(imu_until(stamp_ns))
         rectified = rectifier.rectify(frame)
         if localizer.perception.awaits(rectified):
             continue
@@ -198,7 +182,7 @@ def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> N
         lost += odometry.status is OdometryStatus.DEGRADED
         places.append((stamp_ns, odometry.odom_from_body))
     moved = se3_inverse(at(places, 2_200_000_000)) @ at(places, 3_000_000_000)
-    truth = se3_inverse(Ride().map_from_body(2.2)) @ Ride().map_from_body(3.0)
+    truth = se3_inverse(RIDE(2.2)) @ RIDE(3.0)
     assert np.linalg.norm((moved - truth)[:3, 3]) < 0.03
     assert is_single or lost <= 2, "with both pairs gone for a frame; one camera measures no depth here"
 

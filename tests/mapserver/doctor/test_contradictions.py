@@ -22,7 +22,7 @@ from mapserver.doctor.images import fine_structure, fixed_pattern
 from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
-from support.recordings.painted_room import Ride, write_ride
+from support.recordings.painted_room import standing_first, write_ride
 from support.recordings.spoiled_recording import changed
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
@@ -33,7 +33,7 @@ Change = Callable[[Recording], Recording]
 def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Four seconds along a wall and back, on wheels, with an IMU."""
     path = tmp_path_factory.mktemp("ride") / "ride.mcap"
-    write_ride(path, Ride(4.0, 2.4), SensorSet.STEREO_INERTIAL)
+    write_ride(path, standing_first(4.0, 2.4), 4.0, SensorSet.STEREO_INERTIAL)
     return open_recording(path)
 
 
@@ -206,7 +206,7 @@ def test_depths_in_another_unit(
 ) -> None:
     """Whose fault it is nothing tells where wheels and depths alone know metres: no wheels are left out for it."""
     path = tmp_path_factory.mktemp("rgbd") / "ride.mcap"
-    write_ride(path, Ride(4.0, 2.4), SensorSet.RGBD)
+    write_ride(path, standing_first(4.0, 2.4), 4.0, SensorSet.RGBD)
     with open_recording(path) as good:
         wheels = good.wheel if has_wheels else ()
         scaled = changed(good, lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(factor)))

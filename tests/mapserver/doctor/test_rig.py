@@ -21,11 +21,11 @@ from mapserver.cli import app
 from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.rig import check_mountings, check_rig, further_findings, judge_mounting, mounting_error
-from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
+from support.recordings.painted_room import frame_at, frame_of_both, from_behind, rig, standing_first
+from support.recordings.recording_samples import FRAME_NS
 from support.recordings.rig_samples import write_rig
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, view
 
-REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
 HALF_DEGREE = np.radians(0.5)
 DEGREE_Z = np.array([0.0, 0.0, 2.0 * HALF_DEGREE])
 
@@ -86,18 +86,13 @@ def test_what_a_drive_does_not_show_is_not_judged() -> None:
 STAMPS_NS = range(2_000_000_000, 4_500_000_000, FRAME_NS)
 
 
-class Turned(Ride):
-    def map_from_body(self, time_s: float) -> Array:
-        return np.asarray(super().map_from_body(time_s) @ REAR)
+RIDE = standing_first()
 
 
 @lru_cache(maxsize=1)
 def ride() -> tuple[RigCalibration, list[CameraFrame]]:
-    """A ride in the painted room with a pair in front and one behind, without an IMU."""
-    front = rig(SensorSet.STEREO)
-    rear = (replace(camera, body_from_cam=REAR @ camera.body_from_cam) for camera in front.cameras)
-    pairs = [[frame_at(each, stamp, SensorSet.STEREO) for each in (Ride(), Turned())] for stamp in STAMPS_NS]
-    return replace(front, cameras=(*front.cameras, *rear)), [replace(a, others=(b,)) for a, b in pairs]
+    """A ride in the box room with a pair in front and one behind, without an IMU."""
+    return rig(SensorSet.STEREO, has_rear=True), [frame_of_both(RIDE, stamp) for stamp in STAMPS_NS]
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +128,7 @@ def test_a_depth_camera_behind_is_checked_and_its_mounting_named(tmp_path: Path,
     rig_of_both = with_turned(rig_of_both, turned) if turned else rig_of_both
     with McapRecordingWriter(tmp_path / "ride.mcap", rig_of_both) as writer:
         for frame, stamp_ns in zip(frames, STAMPS_NS, strict=True):
-            behind = frame_at(Turned(), stamp_ns, SensorSet.RGBD)
+            behind = frame_at(from_behind(RIDE), stamp_ns, SensorSet.RGBD)
             writer.write_frame(replace(frame, others=(behind,)))
     with open_recording(tmp_path / "ride.mcap") as recording:
         found = {finding.name: finding for finding in check_rig(recording)}

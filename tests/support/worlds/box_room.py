@@ -27,11 +27,13 @@ from support.recordings.recording_samples import (
     Sample,
     calibration,
 )
+from support.worlds.painted_walls import pixel_rays, reach, view
 
 ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
 GRAVITY_MPS2 = 9.81
-_TEXEL_M, _TEXELS = 0.01, 800
+TEXEL_M, TEXELS = 0.01, 800
 _WALL = 3  # the face at y = 3
+RAYS = pixel_rays(WIDTH, HEIGHT, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
 Ride = Callable[[float], Array]
 
 
@@ -64,7 +66,7 @@ def ride_sample(ride: Ride, frames: int, frame_s: float, *, seed: int = 0, begin
     right = [_render(map_from_body @ BODY_FROM_CAM0 @ shift) for map_from_body in truth]
     imu_times = np.arange(times[0] - 1.0, times[-1] + 0.1, 0.005)
     rng = np.random.default_rng(seed)
-    gyro, accel = (np.array(values) for values in zip(*(_imu(ride, float(t)) for t in imu_times), strict=True))
+    gyro, _, accel = (np.array(values) for values in zip(*(motion(ride, float(t)) for t in imu_times), strict=True))
     gyro += rng.normal([0.003, -0.002, 0.001], 2e-3, gyro.shape)
     accel += rng.normal([0.02, -0.01, 0.03], 2e-2, accel.shape)
     imu_stamps = START_NS + np.rint(imu_times * 1e9).astype(np.int64)
@@ -77,32 +79,18 @@ def there_and_back() -> Sample:
     return ride_sample(out_and_back(6.0), 61, 0.1)
 
 
-def _imu(ride: Ride, t_s: float, h_s: float = 1e-3) -> tuple[Array, Array]:
-    """Angular rate and specific force in body axes, by central differences."""
+def motion(ride: Ride, t_s: float, h_s: float = 1e-3) -> tuple[Array, Array, Array]:
+    """Angular rate, velocity and specific force in body axes, by central differences."""
     before, now, after = ride(t_s - h_s), ride(t_s), ride(t_s + h_s)
-    rate = so3_log(before[:3, :3].T @ after[:3, :3]) / (2 * h_s)
+    axes, rate = now[:3, :3].T, so3_log(before[:3, :3].T @ after[:3, :3]) / (2 * h_s)
+    velocity = (after[:3, 3] - before[:3, 3]) / (2 * h_s)
     acceleration = (before[:3, 3] - 2 * now[:3, 3] + after[:3, 3]) / h_s**2
-    return rate, now[:3, :3].T @ (acceleration + np.array([0, 0, GRAVITY_MPS2]))
+    return rate, axes @ velocity, axes @ (acceleration + np.array([0, 0, GRAVITY_MPS2]))
 
 
 def _render(map_from_cam: Array) -> NDArray[np.uint8]:
-    """One grey image: for each pixel the face of the room that its ray leaves by."""
-    rays, origin = _rays() @ map_from_cam[:3, :3].T, map_from_cam[:3, 3]
-    reach = _reach(rays, origin)
-    axis = np.argmin(reach, axis=2)
-    at = (origin + rays * np.min(reach, axis=2)[..., None] - ROOM_M[0]) / _TEXEL_M
-    face = 2 * axis + (np.take_along_axis(rays, axis[..., None], 2)[..., 0] > 0)
-    across = np.where(axis == 0, at[..., 1], at[..., 0]).astype(np.float32)
-    along = np.where(axis == 2, at[..., 1], at[..., 2]).astype(np.float32)
-    # In steps of OpenCV's interpolation: as exact on the last face as on the first.
-    along = np.rint(along * 32) / 32 + (face * _TEXELS).astype(np.float32)
-    return np.asarray(cv2.remap(_textures(), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _rays() -> Array:
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    return np.stack([(u - (WIDTH / 2 - 0.5)) / FOCAL, (v - (HEIGHT / 2 - 0.5)) / FOCAL, np.ones_like(u, float)], -1)
+    """One grey image."""
+    return view(map_from_cam, RAYS, ROOM_M, _textures(), ROOM_M[0], TEXEL_M, cv2.BORDER_REFLECT)
 
 
 @lru_cache(maxsize=1)
@@ -131,15 +119,15 @@ def poster(seed: int, corners_m: Array, shift_m: float = 0.0) -> Iterator[None]:
 
     corners_m: x and z of the lower left and the upper right one.
     """
-    texture = _textures()[_WALL * _TEXELS : (_WALL + 1) * _TEXELS]
+    texture = _textures()[_WALL * TEXELS : (_WALL + 1) * TEXELS]
     before = texture.copy()
-    (left, low), (right, high) = np.rint((corners_m - ROOM_M[0, [0, 2]]) / _TEXEL_M).astype(int)
+    (left, low), (right, high) = np.rint((corners_m - ROOM_M[0, [0, 2]]) / TEXEL_M).astype(int)
     rng = np.random.default_rng(seed)
     patch = np.full((high - low, right - left), 120.0)
     for _ in range(patch.size * 120 // (160 * 140)):
         at, (w, h) = rng.integers(0, np.array(patch.shape[::-1]) - 10), rng.integers(6, 30, 2)
         patch[at[1] : at[1] + h, at[0] : at[0] + w] = rng.uniform(20, 235)
-    shifted = np.roll(cv2.GaussianBlur(patch, (0, 0), 1.2), round(shift_m / _TEXEL_M), axis=1)
+    shifted = np.roll(cv2.GaussianBlur(patch, (0, 0), 1.2), round(shift_m / TEXEL_M), axis=1)
     texture[low:high, left:right] = shifted
     try:
         yield
@@ -152,18 +140,12 @@ def points_seen(map_from_cam: Array, pixels: Array) -> Array:
     rays_cam = np.column_stack([(pixels - [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5]) / FOCAL, np.ones(len(pixels))])
     rays = rays_cam @ map_from_cam[:3, :3].T
     origin = map_from_cam[:3, 3]
-    return origin + rays * _reach(rays, origin).min(axis=1)[:, None]
+    return origin + rays * reach(rays, origin, ROOM_M).min(axis=1)[:, None]
 
 
 def depth_of(map_from_cam: Array) -> NDArray[np.float32]:
     """(H, W) metres along the camera's axis."""
-    return _reach(_rays() @ map_from_cam[:3, :3].T, map_from_cam[:3, 3]).min(axis=2).astype(np.float32)
-
-
-def _reach(rays: Array, origin: Array) -> Array:
-    """How many times each ray (..., 3) goes to the room's faces across each axis."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays)
+    return reach(RAYS @ map_from_cam[:3, :3].T, map_from_cam[:3, 3], ROOM_M).min(axis=2).astype(np.float32)
 
 
 def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:

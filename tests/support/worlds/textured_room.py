@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
+from support.worlds import painted_walls
 from support.worlds.inertial_motion import analytic_motion
 
 CAMERA = StereoCamera(190.0, 160.0, 100.0, 0.12, 320, 200)
 BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.05, 0.03, 0.02]))
-HALF_SIZE_M = np.array([4.5, 4.0, 2.0])
-_PIXELS_PER_M = 70.0
-_SIDE = 720
+_RAYS = painted_walls.pixel_rays(CAMERA.width_px, CAMERA.height_px, CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px)
+_ROOM_M = np.array([[-4.5, -4.0, -2.0], [4.5, 4.0, 2.0]])
+_SIDE, _TEXEL_M = 720, 1 / 70
+_BEGIN_M = np.full(3, -_SIDE / 2 * _TEXEL_M)
 
 
 def rig(imu: ImuNoise | None) -> RigCalibration:
@@ -46,22 +48,7 @@ def _walls(seed: int) -> NDArray[np.uint8]:
 
 def view(map_from_cam: Array, seed: int = 1) -> NDArray[np.uint8]:
     """Image of the room by one camera inside."""
-    u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
-    rays_cam = np.stack(
-        [(u - CAMERA.cx_px) / CAMERA.focal_px, (v - CAMERA.cy_px) / CAMERA.focal_px, np.ones(u.shape)], -1
-    )
-    rays_map, centre = rays_cam @ map_from_cam[:3, :3].T, map_from_cam[:3, 3]
-    with np.errstate(divide="ignore"):
-        reach = (np.sign(rays_map) * HALF_SIZE_M - centre) / rays_map
-    axis = np.argmin(reach, axis=-1)
-    hit = centre + rays_map * np.take_along_axis(reach, axis[..., None], -1)
-    first = np.where(axis == 0, hit[..., 1], hit[..., 0])
-    second = np.where(axis == 2, hit[..., 1], hit[..., 2])
-    positive = np.take_along_axis(rays_map, axis[..., None], -1)[..., 0] > 0
-    wall = 2 * axis + positive
-    x = (first * _PIXELS_PER_M + _SIDE / 2).astype(np.float32)
-    y = (second * _PIXELS_PER_M + _SIDE / 2 + wall * _SIDE).astype(np.float32)
-    return np.asarray(cv2.remap(_walls(seed), *cv2.convertMaps(x, y, cv2.CV_16SC2), cv2.INTER_LINEAR), np.uint8)
+    return painted_walls.view(map_from_cam, _RAYS, _ROOM_M, _walls(seed), _BEGIN_M, _TEXEL_M)
 
 
 @lru_cache(maxsize=400)

@@ -10,15 +10,16 @@ from fleetmap.recordings import open_recording
 from fleetmap.recordings.tum import read_tum
 from fleetmap.sensors.samples import SensorSet
 from mapserver.cli import app
-from support.recordings.painted_room import FRAME_NS, Ride, write_ride
+from support.recordings.painted_room import standing_first, write_ride
+from support.recordings.recording_samples import FRAME_NS
 from support.room_site import run
 from support.ros2.environment import needs_ros, ros_program
 
 
 @needs_ros
 def test_a_map_of_what_ros_recorded(tmp_path: Path) -> None:
-    way, ride, bag = Ride(3.5, 1.5), tmp_path / "ride.mcap", tmp_path / "bag"
-    write_ride(ride, way, SensorSet.STEREO_INERTIAL)
+    way, ride, bag = standing_first(3.5, 1.5), tmp_path / "ride.mcap", tmp_path / "bag"
+    write_ride(ride, way, 3.5, SensorSet.STEREO_INERTIAL)
     with ros_program("-m", "support.ros2.recorded_drive", str(ride), str(bag)) as recorded:
         assert recorded.wait(120) == 0
     with open_recording(bag) as theirs, open_recording(ride) as sent:
@@ -36,7 +37,7 @@ def test_a_map_of_what_ros_recorded(tmp_path: Path) -> None:
     files = ["--trajectory-out", tmp_path / "estimate.tum"]
     run(app, "build", bag, "--site", "lab", "--store", tmp_path / "store", *files)
     estimate = read_tum(tmp_path / "estimate.tum")
-    truth_m = np.array([way.map_from_body(n * FRAME_NS * 1e-9)[:3, 3] for n in range(len(estimate.stamps_ns))])
+    truth_m = np.array([way(n * FRAME_NS * 1e-9)[:3, 3] for n in range(len(estimate.stamps_ns))])
     truth_from_map, _ = align_points(truth_m, estimate.positions_m)
     error_m = np.linalg.norm(transform_points(truth_from_map, estimate.positions_m) - truth_m, axis=1)
     assert len(error_m) == 70

@@ -16,7 +16,7 @@ from fleetmap.version_grid import TILE_CELLS
 from mapserver import releases
 from mapserver.store import MapStore, Retention
 from support.drawn_areas import geojson
-from support.recordings.painted_room import Ride, write_ride
+from support.recordings.painted_room import standing_first, write_ride
 from support.storage.dense_samples import save_surfel_draft, seen_wall, surfel_extras, wall
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 
@@ -176,7 +176,7 @@ def test_wrong_orders_for_surfels_are_told(run, walled, tmp_path: Path) -> None:
     assert "surfel_map = true" in run("map", "splats", *walled, 1, tmp_path / "a.ply", status=2)
     assert "has no version 7" in run("map", "splats", *walled, 7, tmp_path / "a.ply", status=2)
     assert "must end in .ply" in run("map", "splats", *walled, 2, tmp_path / "a.obj", status=2)
-    write_ride(tmp_path / "other.mcap", Ride(), SensorSet.STEREO)
+    write_ride(tmp_path / "other.mcap", standing_first(), 6.0, SensorSet.STEREO)
     wanted = (*walled, 2, tmp_path / "other.mcap")
     assert "must end in .ply" in run("map", "refine", *wanted, tmp_path / "a.obj", status=2)
     assert "is not of version 2" in run("map", "refine", *wanted, tmp_path / "a.ply", status=2)
