@@ -23,11 +23,13 @@ class CameraView(NamedTuple):
     """information (6, 6) and score (6,) = information @ estimate of the first parameters of `PARAMETERS`.
 
     pose_per_parameter (6, 6): derivative of a fix's pose, a left perturbation of cam_from_map in camera axes, by each parameter.
+    A look of the watch has information and score of all of `PARAMETERS` and the map's tilt; ids: of its landmarks.
     """
 
     information: Array
     score: Array
     pose_per_parameter: Array
+    ids: frozenset[int] = frozenset()
 
 
 def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
 from fleetmap.sensors.rectification import MountedRig
 from locclient.localization.calibration import mounting
-from locclient.localization.calibration.camera_view import camera_view, pair_offsets
+from locclient.localization.calibration.camera_view import CameraView, camera_view, pair_offsets
 from locclient.localization.calibration.mounting import BasePose, WheelTravel
 from locclient.localization.calibration.parameters import (
     BIAS_LIMIT_M,
@@ -49,16 +49,6 @@ _PRIOR_SIGMA = 10.0  # of a parameter: practically none; keeps the equations reg
 _JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the prior was not judged
 
 
-@dataclass(frozen=True)
-class _Look:
-    """Information and score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
-
-    information: Array
-    score: Array
-    pose_per_parameter: Array
-    ids: frozenset[int]
-
-
 class CalibrationWatch:
     """Compares observations with the map in which the robot is localized. Estimates do not change until a parameter has drifted.
 
@@ -72,7 +62,7 @@ class CalibrationWatch:
     def __init__(self, rig: MountedRig, stereo_settings: StereoSettings) -> None:
         self._rig, self._stereo = rig, stereo_settings
         self._cam_from_body = se3_inverse(rig.mounted[0].body_from_cam)
-        self._looks: deque[_Look] = deque(maxlen=_WINDOW)
+        self._looks: deque[CameraView] = deque(maxlen=_WINDOW)
         self.wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
@@ -107,7 +97,7 @@ class CalibrationWatch:
             information[:IMAGE, :IMAGE], score[:IMAGE] = share * seen.information, share * seen.score
         self._add_mounting(query, information, score)
         shift = np.zeros((6, IMAGE)) if seen is None else seen.pose_per_parameter
-        self._looks.append(_Look(information, score, shift, ids))
+        self._looks.append(CameraView(information, score, shift, ids))
         state = self._judged(_MIN_CONFIRMED_LOOKS if query.is_confirmed else _MIN_LOOKS)
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
@@ -193,7 +183,7 @@ def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
     return replace(matched, pixels=np.column_stack([matched.pixels[:, :2], columns]))
 
 
-def _estimate(looks: Sequence[_Look]) -> tuple[Array, Array]:
+def _estimate(looks: Sequence[CameraView]) -> tuple[Array, Array]:
     """Return values and sigmas (COUNT,) of PARAMETERS by looks, infinite if unobserved; one look determines those of the images alone."""
     prior = np.array([_PRIOR_SIGMA] * COUNT + [_MAP_TILT_SIGMA_RAD] * 2) ** -2.0
     information = np.array([look.information for look in looks])
@@ -210,7 +200,7 @@ def _estimate(looks: Sequence[_Look]) -> tuple[Array, Array]:
     return value[:COUNT], np.where(is_shown, np.hypot(sigma, common), np.inf)
 
 
-def _state(looks: Sequence[_Look], value: Array, sigma: Array) -> CalibrationState:
+def _state(looks: Sequence[CameraView], value: Array, sigma: Array) -> CalibrationState:
     shifts = np.array([look.pose_per_parameter for look in looks])  # (V, 6, IMAGE)
     each = shifts * value[:IMAGE]
     bias_m = np.sqrt((each[:, 3:] ** 2).sum(axis=1).mean(axis=0))
@@ -233,7 +223,7 @@ def _state(looks: Sequence[_Look], value: Array, sigma: Array) -> CalibrationSta
     return CalibrationState(tuple(drifts), cov_bias + _cov_elsewhere(value, sigma), text)
 
 
-def _tilt_in_doubt(looks: Sequence[_Look], value: Array, sigma: Array) -> float:
+def _tilt_in_doubt(looks: Sequence[CameraView], value: Array, sigma: Array) -> float:
     """Return the camera rotation about the body's x or y, rad, by gravity if the map is level; 0 if turns of the robot exclude it."""
     information = sum((look.information[TILT, TILT] for look in looks), 1e-9 * np.eye(2))
     covariance = np.linalg.inv(information)

@@ -2,10 +2,9 @@
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 from fleetmap.bus.endpoints import handshake_fault
@@ -55,22 +54,19 @@ def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]
         yield Finding(FAIL, "configuration", str(error))
         return
     yield Finding(OK, "configuration", f"{address.robot} at {address.site}, source {config.source.kind}")
-    yield from _guarded("calibration", lambda: _sensors(config, listen_s))
-    yield _clock(time.time_ns(), _SYNCHRONISED.exists())
-    yield from _guarded("spool", lambda: _outbox(config, address))
+    clock = _clock(time.time_ns(), _SYNCHRONISED.exists())
+    checks = {"calibration": _sensors(config, listen_s), "clock": clock, "spool": _outbox(config, address)}
     if address.store is not None:
-        yield from _guarded("store", lambda: _store(address))
-        return
-    if address.identity is not None:
-        yield from _guarded("identity", partial(_identity, address.identity, datetime.now(UTC)))
-    yield from _guarded("cache", lambda: _cache_and_server(config, address))
-
-
-def _guarded(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    try:
-        yield from check()
-    except FleetmapError as error:
-        yield Finding(FAIL, what, str(error))
+        checks["store"] = _store(address)
+    else:
+        if address.identity is not None:
+            checks["identity"] = _identity(address.identity)
+        checks["cache"] = _cache_and_server(config, address)
+    for what, findings in checks.items():
+        try:
+            yield from findings
+        except FleetmapError as error:
+            yield Finding(FAIL, what, str(error))
 
 
 def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
@@ -165,14 +161,15 @@ class _StampRecorder(Intake):
         return True
 
 
-def _clock(now_ns: int, synchronised: bool) -> Finding:
+def _clock(now_ns: int, synchronised: bool) -> Iterator[Finding]:
     if now_ns < _OLD_NS:
         text = f"the system's clock says {now_ns // 10**9} s since 1970; set it, and enable its synchronisation"
-        return Finding(FAIL, "clock", text)
-    if not synchronised:
+        yield Finding(FAIL, "clock", text)
+    elif not synchronised:
         hint = "enable NTP or PTP (timedatectl); the server measures how far this robot's clock is off"
-        return Finding(WARN, "clock", f"not known to be synchronised; {hint}")
-    return Finding(OK, "clock", "synchronised")
+        yield Finding(WARN, "clock", f"not known to be synchronised; {hint}")
+    else:
+        yield Finding(OK, "clock", "synchronised")
 
 
 def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
@@ -195,9 +192,9 @@ def _store(address: MapAddress) -> Iterator[Finding]:
     yield _pieces("store", wanted.version, len(tiles), list(refused.values()))
 
 
-def _identity(identity: RobotIdentity, now: datetime) -> Iterator[Finding]:
+def _identity(identity: RobotIdentity) -> Iterator[Finding]:
     about = identity.certificate()
-    days = (about.ends - now).total_seconds() / 86_400
+    days = (about.ends - datetime.now(UTC)).total_seconds() / 86_400
     is_old = days < _CERTIFICATE_DAYS
     hint = "; the running robot renews it, let it reach its server" if is_old else ""
     yield Finding(WARN if is_old else OK, "identity", f"{about.name}, certificate for {days:.0f} days{hint}")

@@ -47,7 +47,7 @@ class Origins:
     def check(self) -> None:
         """Raise UsageError for an invalid origin."""
         for text in self.allowed:
-            origin = _origin(urlsplit(text))
+            origin = _origin(text)
             if origin is None or urlsplit(text).path not in {"", "/"}:
                 raise UsageError(f"{text!r} is not like https://HOST or https://HOST:PORT")
             if origin[0] == "http" and not (self.insecure or is_loopback_name(origin[1])):
@@ -55,14 +55,11 @@ class Origins:
 
     def admit(self, link: str) -> SplitResult:
         """Return the parts of a link; LinkError unless it points to one of the servers."""
-        try:
-            parts = urlsplit(link)
-            origin = _origin(parts)
-        except ValueError:
-            origin = None
+        origin = _origin(link)
         if origin is None or any(ord(sign) < 33 or ord(sign) > 126 for sign in link):
             raise LinkError(f"the link {link[:200]!r} is not a plain http or https address")
-        if origin not in {_origin(urlsplit(text)) for text in self.allowed}:
+        parts = urlsplit(link)
+        if origin not in map(_origin, self.allowed):
             raise LinkError(
                 f"the link points to {parts.netloc[:200]!r}, and the robot takes maps from "
                 f"{', '.join(self.allowed) or 'nowhere'}; [vda5050] download_from names the servers"
@@ -84,7 +81,7 @@ def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) 
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
     try:
         connection.connect()
-        # Each byte of a head, and each `100 Continue`, begins the socket's own time anew.
+        # Each byte of a head, and each `100 Continue`, begins the socket's own time anew; that of a handshake is limited as a whole.
         late = threading.Timer(_STALL_S, connection.sock.shutdown, (socket.SHUT_RDWR,))
         late.start()
         try:
@@ -129,9 +126,10 @@ def _connection(parts: SplitResult, origins: Origins) -> http.client.HTTPConnect
     return http.client.HTTPSConnection(host, port, timeout=_STALL_S, context=context)
 
 
-def _origin(parts: SplitResult) -> tuple[str, str, int] | None:
+def _origin(link: str) -> tuple[str, str, int] | None:
     """Return scheme, host and port; None for an invalid web address, or one that contains a name and password."""
     try:
+        parts = urlsplit(link)
         port = parts.port or (443 if parts.scheme == "https" else 80)
     except ValueError:
         return None

@@ -18,7 +18,7 @@ from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
 from locclient.plugins.vda5050.fleet_maps import FleetMaps, Origins
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
-from locclient.plugins.vda5050.settings import Broker, Vda5050Section, check_section, read_secret
+from locclient.plugins.vda5050.settings import Vda5050Section, check_section, read_secret
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -36,10 +36,11 @@ class MqttLink:
     """Connects and reconnects in the background. A message that cannot be sent is dropped, because the next state replaces it."""
 
     def __init__(
-        self, broker: Broker, section: Vda5050Section, adapter: FleetAdapter, factsheet: dict[str, Any] | None
+        self, section: Vda5050Section, adapter: FleetAdapter, factsheet: dict[str, Any] | None, *, insecure: bool
     ) -> None:
         """Raises UsageError if paho-mqtt is missing, or the broker's authorities cannot be read."""
-        self.adapter, self._broker, self._section, self._factsheet = adapter, broker, section, factsheet
+        self.adapter, self._section, self._factsheet = adapter, section, factsheet
+        self._host, self._port, self._is_tls, self._password = check_section(section, insecure=insecure)
         self._dialect = Dialect(section.version)
         self._prefix = f"{section.interface}/{self._dialect.major}/{section.manufacturer}/{section.serial_number}"
         self._sent: Counter[str] = Counter()
@@ -63,7 +64,7 @@ class MqttLink:
             limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             limits.MaximumPacketSize = _MAX_PACKET_BYTES  # the broker keeps larger ones back
             more = {"clean_start": True, "properties": limits}
-        self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
+        self._client.connect_async(self._host, self._port, _KEEPALIVE_S, **more)
         self._client.loop_start()
         self._thread.start()
 
@@ -110,12 +111,11 @@ class MqttLink:
         client.suppress_exceptions = True  # exceptions would end paho's thread; its logger has them
         client.enable_logger(_log)
         client.reconnect_delay_set(1, 30)
-        if self._broker.username is not None:
-            client.username_pw_set(self._broker.username, self._broker.password)
-        if self._broker.is_tls:
-            ca = None if self._broker.ca is None else str(self._broker.ca)
-            with disk_errors(f"[vda5050] ca {ca} cannot be read", "check the path", UsageError):
-                client.tls_set_context(ssl.create_default_context(cafile=ca))
+        if self._section.username is not None:
+            client.username_pw_set(self._section.username, self._password)
+        if self._is_tls:
+            with disk_errors(f"[vda5050] ca {self._section.ca} cannot be read", "check the path", UsageError):
+                client.tls_set_context(ssl.create_default_context(cafile=self._section.ca))
         client.on_pre_connect = lambda *_: self._set_will()
         client.on_connect = self._on_connect
         client.on_message = self._on_message
@@ -128,7 +128,7 @@ class MqttLink:
 
     def _on_connect(self, client: "Client", _: object, __: object, reason: Any, ___: object) -> None:
         if reason.is_failure:
-            _log.warning("the broker %s refuses the robot: %s", self._broker.host, reason)
+            _log.warning("the broker %s refuses the robot: %s", self._host, reason)
             return
         for topic in self._heard:
             client.subscribe(f"{self._prefix}/{topic}", qos=0)
@@ -190,7 +190,7 @@ def open_link(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
         maps = FleetMaps(robot.client, Origins(section.download_from, token, ca, robot.insecure))
     adapter = FleetAdapter(section, maps, robot)
     sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), Dialect(section.version))
-    mqtt = MqttLink(check_section(section, insecure=robot.insecure), section, adapter, sheet)
+    mqtt = MqttLink(section, adapter, sheet, insecure=robot.insecure)
     return RobotLink(
         start=mqtt.start,
         stop=mqtt.stop,

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -43,19 +43,8 @@ class Vda5050Section(Section, frozen=True):
     initial_sigma_rad: _Positive = 0.2
 
 
-class Broker(NamedTuple):
-    """Address of the broker. ca: file of the authorities, None for the machine's."""
-
-    host: str
-    port: int
-    is_tls: bool
-    ca: Path | None
-    username: str | None
-    password: str | None
-
-
-def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
-    """Return the broker of the section; UsageError for missing or invalid settings."""
+def check_section(section: Vda5050Section, *, insecure: bool) -> tuple[str, int, bool, str | None]:
+    """Return the broker's host and port, True for TLS, and the password; UsageError for missing or invalid settings."""
     match = _BROKER.fullmatch(section.broker or "")
     if match is None:
         raise UsageError(f"[vda5050] broker = {section.broker!r} is not like mqtts://HOST or mqtts://HOST:PORT")
@@ -74,9 +63,8 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
         )
     if (section.username is None) != (section.password_file is None):
         raise UsageError("[vda5050] username and password_file belong together")
-    ca = None if section.ca is None else Path(section.ca)
     password = None if section.password_file is None else read_secret(section.password_file)
-    return Broker(host, port, scheme == "mqtts", ca, section.username, password)
+    return host, port, scheme == "mqtts", password
 
 
 def read_secret(path: str) -> str:

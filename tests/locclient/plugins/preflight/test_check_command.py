@@ -51,9 +51,9 @@ def test_what_is_wrong_is_told(
 
 
 def test_clocks_are_judged() -> None:
-    assert _clock(5, True).level == "fail"
-    assert _clock(1_800_000_000 * 10**9, False).level == "warn"
-    assert _clock(1_800_000_000 * 10**9, True).level == "ok"
+    assert next(_clock(5, True)).level == "fail"
+    assert next(_clock(1_800_000_000 * 10**9, False)).level == "warn"
+    assert next(_clock(1_800_000_000 * 10**9, True)).level == "ok"
 
 
 @pytest.mark.parametrize(("shift_px", "level"), [(12, "ok"), (-12, "fail"), (0, "warn")])
