@@ -5,8 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -188,21 +186,13 @@ def _building_maps(
     return building
 
 
-def _keep_certificate(address: MapAddress, bus: Bus) -> None:
-    """Renew the certificate of an enrolled robot once it is a month old."""
-    identity = address.identity
-    if identity is not None and identity.is_renewal_due(datetime.now(UTC)):
-        identity.renew(bus)
-        _log.info("the certificate is renewed until %s", identity.certificate().ends)
-
-
 def _server(
     config: LocclientConfig, address: MapAddress, bus: Bus, outbox: Outbox, cache: TileCache, intake: Intake
 ) -> ServerSync:
     """Return the exchange with the map server, and with the links that the file asks for."""
     client = map_client(bus, cache, address)
-    upkeep, retry_s = partial(_keep_certificate, address, bus), config.run.trial.retry_s
-    server = ServerSync(client, outbox, retry_s=retry_s, upkeep=upkeep, put_prior=intake.put_prior)
+    retry_s, identity = config.run.trial.retry_s, address.identity
+    server = ServerSync(client, outbox, retry_s=retry_s, identity=identity, put_prior=intake.put_prior)
     server.is_alone = address.server is None
     lost_radius_m = config.localizer.track.lost_radius_m
     robot = LinkedRobot(client, config.run.insecure, lost_radius_m, server.fetched.append, intake.put_prior)

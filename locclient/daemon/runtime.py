@@ -30,7 +30,7 @@ from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.maps.building_maps import BuildingMaps
-from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
+from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.outputs import Publisher
@@ -85,7 +85,6 @@ class Runtime:
         self._failures: deque[tuple[FailureContext, int]] = deque(maxlen=_MAX_PENDING)
         # Owned by the localizing thread.
         self._figures = HealthFigures()
-        self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
         self._last_frame_s = time.monotonic()
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._refusals = LogLimit(_log)
@@ -207,7 +206,7 @@ class Runtime:
         self._figures.handle(outcome)
         if self._figures.search.is_long != was_lost:
             _log.warning("%s", "localized again" if was_lost else self._figures.search.words)
-        self._bound = self._bound_tracker.handle(estimate)
+        self._bound = self._bound.after(estimate, self._parts.tile_loader.settings.most_mps)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()
         server = None if self._server is None or self._server.is_alone else self._server

@@ -4,6 +4,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.log_lines import LogLimit
@@ -14,13 +15,14 @@ from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.hooks import RobotLink
+from locclient.identity import RobotIdentity
 from locclient.localization.priors.given import told_prior
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient
 from locclient.robot.version_trial import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
-_UPKEEP_EVERY_S = 3600.0
+_RENEW_EVERY_S = 3600.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
 _AWAY_S = 10.0  # without a connection before the log says so: shorter gaps of a radio network are usual
 _REPLAY_PART_EVERY_S = 1.0  # a quarter of a megabyte: two megabits a second
@@ -43,22 +45,21 @@ class ServerSync:
         retry_s: float,
         clock_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
-        upkeep: Callable[[], None] = lambda: None,
+        identity: RobotIdentity | None = None,
         put_prior: Callable[[PositionPrior], None] = lambda _: None,
     ) -> None:
-        """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged. put_prior:
-        called with operators' poses, on a thread of the bus."""
+        """retry_s: delay before a postponed version is offered again. put_prior: called with operators' poses, on a thread of the bus."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self.building: BuildingMaps | None = None
         self.recordings_at_s = 0.0
-        # The upkeep first: after a renewal whose response was lost, the server admits no other request.
-        jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
-        self._jobs = Jobs(*jobs, passed=UnreachableError, clock_s=clock_s)
+        # The certificate first: after a renewal whose response was lost, the server admits no other request.
+        jobs = self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings
+        self._jobs = Jobs(self._keep_certificate, *jobs, passed=UnreachableError, clock_s=clock_s)
         self.is_alone = False  # there is no server: a link brings versions
         self.links: Sequence[RobotLink] = ()
         self._refusals = LogLimit(_log)  # repeated refusals would fill the log
-        self._upkeep, self._upkeep_at_s = upkeep, 0.0
+        self._identity, self._renew_at_s = identity, 0.0
         self.client, self._outbox, self._retry_s, self._put_prior = client, outbox, retry_s, put_prior
         self._clock_s, self._wall_ns = clock_s, wall_ns
         self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is sent
@@ -101,10 +102,13 @@ class ServerSync:
             raise LinkError(f"a pose for robot {told.robot!r} of {told.site!r} was sent to {robot} of {site}")
         self._put_prior(told_prior(told))
 
-    def _keep_up(self) -> None:
-        if self._clock_s() >= self._upkeep_at_s:
-            self._upkeep_at_s = self._clock_s() + _UPKEEP_EVERY_S
-            self._upkeep()
+    def _keep_certificate(self) -> None:
+        """Renew the certificate of an enrolled robot once it is a month old; look once an hour."""
+        if self._identity is not None and self._clock_s() >= self._renew_at_s:
+            self._renew_at_s = self._clock_s() + _RENEW_EVERY_S
+            if self._identity.is_renewal_due(datetime.now(UTC)):
+                self._identity.renew(self.client.bus)
+                _log.info("the certificate is renewed until %s", self._identity.certificate().ends)
 
     def _is_connected(self, now_s: float) -> bool:
         """True if a peer is reachable. The log says once that none is, and when one is again."""

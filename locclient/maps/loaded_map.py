@@ -29,37 +29,30 @@ class TileSelectionSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class PositionBound:
-    """Bound of the robot's position: within radius_m of a position (3,), None for anywhere; with its velocity (3,)."""
+    """Bound of the robot's position: within radius_m of that of the last estimate with a pose (3,), at stamp_ns, None for anywhere; with
+    its velocity (3,)."""
 
     position_map_m: Array | None = None
     velocity_map_mps: Array = field(default_factory=lambda: np.zeros(3))
     radius_m: float = 0.0
+    stamp_ns: int = 0
 
+    def after(self, estimate: Estimate, most_mps: float) -> "PositionBound":
+        """Return the bound by a further estimate. While the robot is lost, it grows at the assumed maximum speed.
 
-class PositionBoundTracker:
-    """Tracks the position bound by a robot's estimates. While it is lost, the bound grows at the assumed maximum speed.
-
-    A lost robot's estimate may leave the held tiles, and without tiles it cannot be localized elsewhere. All tiles of a large site
-    may exceed its memory.
-    """
-
-    def __init__(self, settings: TileSelectionSettings) -> None:
-        self._settings = settings
-        self._known: tuple[int, Array] | None = None  # stamp and position of the last estimate with a pose
-
-    def handle(self, estimate: Estimate) -> PositionBound:
+        A lost robot's estimate may leave the held tiles, and without tiles it cannot be localized elsewhere. All tiles of a large site
+        may exceed its memory.
+        """
         if not estimate.is_at_home:  # another site's map, which says nothing of this one's tiles
-            self._known = None
             return PositionBound()
         if estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}:
-            self._known = (estimate.stamp_ns, estimate.map_from_body[:3, 3])
-            odometry = estimate.odometry
+            odometry, position_map_m = estimate.odometry, estimate.map_from_body[:3, 3]
             turn = estimate.map_from_body[:3, :3] @ odometry.odom_from_body[:3, :3].T
-            return PositionBound(self._known[1], np.asarray(turn @ odometry.velocity_odom_mps))
-        if self._known is None:
-            return PositionBound()
-        radius_m = (estimate.stamp_ns - self._known[0]) * 1e-9 * self._settings.most_mps
-        return PositionBound(self._known[1], radius_m=_RADIUS_STEP_M * np.ceil(radius_m / _RADIUS_STEP_M))
+            return PositionBound(position_map_m, turn @ odometry.velocity_odom_mps, stamp_ns=estimate.stamp_ns)
+        if self.position_map_m is None:
+            return self
+        radius_m = _RADIUS_STEP_M * np.ceil((estimate.stamp_ns - self.stamp_ns) * 1e-9 * most_mps / _RADIUS_STEP_M)
+        return PositionBound(self.position_map_m, radius_m=radius_m, stamp_ns=self.stamp_ns)
 
 
 def tiles_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> frozenset[Cell]:

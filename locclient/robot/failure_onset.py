@@ -2,7 +2,8 @@
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import dist
 
 import cv2
 import numpy as np
@@ -26,13 +27,12 @@ _DROPPED_STEPS = 1.5  # shortest steps between frames; frames are missing in a l
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """The last claimed pose of a robot: map_from_body (4, 4), cov_rot_trans (6, 6) of the frame at stamp_ns.
+    """The last claimed pose of a robot: map_from_body (4, 4), cov_rot_trans (6, 6).
 
     odom_from_body (4, 4) of the same frame, in an odometry frame that is never redefined. fix_ns: stamp of the last fix until then;
     recall: share of the expected landmarks found by it.
     """
 
-    stamp_ns: int
     map_from_body: Array
     cov_rot_trans: Array
     odom_from_body: Array
@@ -40,26 +40,27 @@ class Belief:
     recall: float
     floor: str = ""  # as of `Estimate`
 
-    def carried_on(self, odom_from_body: Array) -> Array:
-        return self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
+    def carried_on(self, odom_from_body: Array) -> "Belief":
+        """Return the belief with its pose propagated by odometry, and its covariance as it was."""
+        map_from_body = self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
+        return replace(self, map_from_body=map_from_body, odom_from_body=odom_from_body)
 
     def off_m(self, map_from_body: Array, odom_from_body: Array) -> float:
         """Return the distance of a pose from the belief, carried on."""
-        return float(np.linalg.norm(map_from_body[:3, 3] - self.carried_on(odom_from_body)[:3, 3]))
+        return dist(map_from_body[:3, 3], self.carried_on(odom_from_body).map_from_body[:3, 3])
 
 
 @dataclass(frozen=True, slots=True)
 class Onset:
     """The first frame of a failure. left: its left image, of the view compared with the map; pictures: stamps, small images, oldest first.
 
-    map_from_body (4, 4): the belief, propagated to this frame; None, as is belief, if the robot had claimed no pose.
+    belief: carried on to this frame; None if the robot had claimed no pose.
     """
 
     stamp_ns: int
     left: Image
     pictures: tuple[tuple[int, Image], ...]
     belief: Belief | None
-    map_from_body: Array | None
     view: int = 0
 
 
@@ -111,7 +112,7 @@ class OnsetRecorder:
         # A claimed pose is one without competitors that is not an unconfirmed candidate.
         if estimate.map_from_body is not None and estimate.cov_rot_trans is not None and not estimate.hypotheses:
             claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
-            self._belief = Belief(stamp_ns, *claimed, *self._fix, estimate.floor)
+            self._belief = Belief(*claimed, *self._fix, estimate.floor)
         if last is not None and self._breaks(last[0], estimate):
             self._break = self._onset(stamp_ns, frame, odom_from_body, estimate.view)
         for kind, began_ns in begun_ns.items():
@@ -139,16 +140,14 @@ class OnsetRecorder:
         """Return evidence for the cause of a failure detected with this estimate."""
         found = self._open.get(kind)
         belief = self._belief if found is None else found.belief
-        elsewhere = estimate.hypotheses
-        if belief is not None:  # beyond the error limit and its radius
+        elsewhere, wrong_by_m, had_fix = estimate.hypotheses, estimate.moved_m, False
+        if belief is not None:
+            had_fix = began_ns - belief.fix_ns <= _RECENT_FIX_NS
             limit_m = max(ERROR_LIMIT_M, radius_95_m(belief.cov_rot_trans))
             elsewhere = tuple(h for h in elsewhere if belief.off_m(h.map_from_body, odom_from_body) > limit_m)
-        agreed = [h for h in elsewhere if h.support >= _AGREEING_FIXES]
-        wrong_by_m = estimate.moved_m
-        if wrong_by_m is None and belief is not None and agreed:
-            best = max(agreed, key=lambda hypothesis: hypothesis.support)
-            wrong_by_m = belief.off_m(best.map_from_body, odom_from_body)
-        had_fix = belief is not None and began_ns - belief.fix_ns <= _RECENT_FIX_NS
+            best = max(elsewhere, key=lambda hypothesis: hypothesis.support, default=None)
+            if wrong_by_m is None and best is not None and best.support >= _AGREEING_FIXES:
+                wrong_by_m = belief.off_m(best.map_from_body, odom_from_body)
         places = sum(hypothesis.support >= 2 for hypothesis in elsewhere)
         return Evidence(wrong_by_m, self._is_break_of(began_ns), had_fix, places)
 
@@ -167,9 +166,8 @@ class OnsetRecorder:
     def _onset(self, stamp_ns: int, frame: RectifiedFrame, odom_from_body: Array, view: int) -> Onset:
         before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]
         chosen = {picture[0]: picture[1] for picture in before if picture is not None}
-        belief, left = self._belief, _left(frame, view)
-        map_from_body = None if belief is None else belief.carried_on(odom_from_body)
-        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, map_from_body, view)
+        belief, left = self._belief and self._belief.carried_on(odom_from_body), _left(frame, view)
+        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, view)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
         """Return the picture nearest to a stamp, at most 0.5 s off and before `before_ns`."""

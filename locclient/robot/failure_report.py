@@ -120,8 +120,8 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     image = None if failure.cause is Cause.NO_FRAMES else failure.estimate.image
     belief, map_from_base, is_own = onset.belief, None, failure.estimate.is_at_home
     # The server has no place for a pose in another site's map.
-    if onset.map_from_body is not None and is_own and not (belief and belief.floor):
-        map_from_base = onset.map_from_body @ se3_inverse(profile.rig.base_from_body)
+    if belief is not None and is_own and not belief.floor:
+        map_from_base = belief.map_from_body @ se3_inverse(profile.rig.base_from_body)
     tile = None
     if map_from_base is not None and context.running is not None:
         x_tile, y_tile = (map_from_base[:2, 3] // context.running.manifest.tile_size_m).tolist()
@@ -129,9 +129,8 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     camera, body_from_cam = profile.rig.mounted[onset.view]
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
-    cause = failure.cause
-    if seen is not None and matches is not None and cause is not Cause.CALIBRATION:
-        cause = Cause.MAP_CHANGED if _has_map_changed(context, profile, len(matches[2]), seen) else cause
+    has_changed = matches is not None and _has_map_changed(context, profile, matches[2])
+    cause = Cause.MAP_CHANGED if has_changed else failure.cause
     innovations = [note.innovation for note in failure.fixes if note.innovation is not None]
     inliers = [note.inliers for note in failure.fixes if note.inliers is not None]
     return FailureReport(
@@ -171,25 +170,24 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
     """Return expected matches at the believed pose, in the image without a fix; None without a pose or its map."""
     onset, running = context.unmatched, context.running
-    if onset.map_from_body is None or running is None:
-        return None
-    if onset.belief is not None and onset.belief.floor != context.failure.estimate.floor:
+    if onset.belief is None or running is None or onset.belief.floor != context.failure.estimate.floor:
         return None
     camera, body_from_cam = profile.rig.mounted[onset.view]
-    map_from_cam = onset.map_from_body @ body_from_cam
+    map_from_cam = onset.belief.map_from_body @ body_from_cam
     return expected_matches(onset.left, camera, map_from_cam, running.tiles.values(), profile.settings)
 
 
-def _has_map_changed(context: FailureContext, profile: RobotProfile, expected: int, seen: int) -> bool:
+def _has_map_changed(context: FailureContext, profile: RobotProfile, hit: NDArray[np.int64]) -> bool:
     """Return True if far fewer landmarks than expected were found at a known place, with good images and odometry.
 
-    The map must expect twice the landmarks of a fix, at the robot's recall until then, and less than half of them are seen.
+    The map must expect twice the landmarks of a fix, at the robot's recall until then, and less than half of them are seen. hit: as of
+    `expected_matches`.
     """
     failure, belief = context.failure, context.unmatched.belief
     if failure.cause is not Cause.NO_MATCH or belief is None or context.evidence.broke:
         return False
-    usual = belief.recall * expected
-    return usual >= 2 * profile.settings.fix.min_inliers and seen < 0.5 * usual
+    usual = belief.recall * len(hit)
+    return usual >= 2 * profile.settings.fix.min_inliers and int((hit >= 0).sum()) < 0.5 * usual
 
 
 def _thumbnails(

@@ -22,9 +22,4 @@ def _open(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
     return open_link(section, robot)
 
 
-LINK = LinkHook(
-    section=Vda5050Section,
-    is_on=lambda section: section.broker is not None,
-    check=_check,
-    open=_open,
-)
+LINK = LinkHook(Vda5050Section, lambda section: section.broker is not None, _check, _open)

@@ -26,7 +26,7 @@ from fleetmap.messages import (
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.maps import map_client
 from locclient.maps.building_maps import BuildingMaps
-from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings
+from locclient.maps.loaded_map import PositionBound, TileSelectionSettings
 from locclient.maps.map_client import ChunkReader, MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
@@ -90,28 +90,29 @@ def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:
 
 def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, MapStore]) -> None:
     """Not those where it says that it is: it would drive out of the map, and never find another bound."""
-    tracker, loader = PositionBoundTracker(SETTINGS), TileLoader(LocalMapSource(row[0], "row"), SETTINGS)
+    loader, most_mps = TileLoader(LocalMapSource(row[0], "row"), SETTINGS), SETTINGS.most_mps
     wanted = LocalMapSource(row[0], "row").wanted()
-    assert tracker.handle(estimate(0.0, Status.AMBIGUOUS, known=False)).position_map_m is None, "anywhere"
-    assert tracker.handle(estimate(1.0, x_m=40.0)).radius_m == 0
+    bound = PositionBound().after(estimate(0.0, Status.AMBIGUOUS, known=False), most_mps)
+    assert bound.position_map_m is None, "anywhere"
+    bound = bound.after(estimate(1.0, x_m=40.0), most_mps)
+    assert bound.radius_m == 0
     held = []
     for seconds in (1, 10, 40):
-        bound = tracker.handle(estimate(1.0 + seconds, Status.LOST, x_m=40.0 + 900.0 * seconds))
+        bound = bound.after(estimate(1.0 + seconds, Status.LOST, x_m=40.0 + 900.0 * seconds), most_mps)
         np.testing.assert_array_equal(bound.position_map_m, [40.0, 0.0, 0.0])
         assert SETTINGS.most_mps * seconds <= bound.radius_m <= SETTINGS.most_mps * seconds + 10
         loaded = loader.load(wanted, bound)
         held.append(sorted(x for x, _ in loaded.tiles))
     assert held == [list(range(5)), list(range(6)), list(range(10))]
-    found = tracker.handle(estimate(42.0, Status.DEGRADED, x_m=140.0))
+    found = bound.after(estimate(42.0, Status.DEGRADED, x_m=140.0), most_mps)
     assert (float(found.position_map_m[0]), found.radius_m) == (140.0, 0.0)  # type: ignore[index]
 
 
 def test_a_place_on_another_floor_bounds_no_tiles_of_its_own_site() -> None:
     """Coordinates there mean nothing here; without all tiles its own floor would not compete with an equal one."""
-    tracker = PositionBoundTracker(SETTINGS)
-    tracker.handle(estimate(0.0, x_m=40.0))
-    assert tracker.handle(replace(estimate(1.0, x_m=140.0), floor="hall-2")).position_map_m is None
-    assert tracker.handle(estimate(2.0, Status.LOST, known=False)).position_map_m is None
+    bound = PositionBound().after(estimate(0.0, x_m=40.0), 3.0)
+    bound = bound.after(replace(estimate(1.0, x_m=140.0), floor="hall-2"), 3.0)
+    assert bound.position_map_m is bound.after(estimate(2.0, Status.LOST, known=False), 3.0).position_map_m is None
 
 
 def test_bad_tiles_are_left_out(row: tuple[Path, MapStore]) -> None:

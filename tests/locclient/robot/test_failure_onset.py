@@ -78,7 +78,7 @@ def test_the_belief_is_that_of_the_beginning() -> None:
     played(recorder, [*before, *blind, *found], begun_s=3.0)
     onset = recorder.onset(BLIND, 3 * 10**9, left(50))
     assert radius_95_m(onset.belief.cov_rot_trans) == pytest.approx(2.796 * 0.03)
-    assert onset.map_from_body[0, 3] == pytest.approx(3.0), "carried on by odometry from 2.9 m"
+    assert onset.belief.map_from_body[0, 3] == pytest.approx(3.0), "carried on by odometry from 2.9 m"
 
 
 @pytest.mark.parametrize("breaks", [False, True])

@@ -94,7 +94,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert report.inliers is not None
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
     map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
-    np.testing.assert_allclose(map_from_cam, told[0].onset.map_from_body @ rig.body_from_cam, atol=1e-9)
+    np.testing.assert_allclose(map_from_cam, told[0].onset.belief.map_from_body @ rig.body_from_cam, atol=1e-9)
     belief = replace(told[0].onset.belief, floor="hall-2")
     onset = replace(told[0].onset, belief=belief)
     other = failure_report(replace(told[0], onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
