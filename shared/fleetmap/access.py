@@ -6,7 +6,7 @@ Messages without a rule are denied, so a certificate is revoked by removing it f
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 from fleetmap.messages import MAP_PARTS, robot_key
 
@@ -21,23 +21,11 @@ _REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20
 _NOBODY = "-"
 
 
-class Direction(StrEnum):
-    """Direction of a message, as the server sees it."""
-
-    IN = "ingress"
-    OUT = "egress"
-
-
-class Act(StrEnum):
-    """Kind of a message."""
-
-    PUT = "put"
-    QUERY = "query"
-    REPLY = "reply"
-    SUBSCRIBE = "declare_subscriber"
-    ANSWER = "declare_queryable"
-    SHOW_ALIVE = "liveliness_token"
-    LOOK_FOR_ALIVE = "liveliness_query"
+# Zenoh's words for the direction of a message, as the server sees it, and for its kind
+Direction = Literal["ingress", "egress"]
+Act = Literal[
+    "put", "query", "reply", "declare_subscriber", "declare_queryable", "liveliness_token", "liveliness_query"
+]
 
 
 class Purpose(StrEnum):
@@ -93,7 +81,7 @@ class Access:
         for holder in self._holders.values():
             groups.setdefault(_rules(holder), []).append(holder.certificate)
         if not groups:  # zenoh refuses empty lists, and lists that are missing
-            groups = {(Rule(_NOBODY, Direction.IN, (Act.PUT,), (_NOBODY,)),): [_NOBODY]}
+            groups = {(Rule(_NOBODY, "ingress", ("put",), (_NOBODY,)),): [_NOBODY]}
         rules = {rule.id: rule for group in groups for rule in group}
         access = {
             "enabled": True,
@@ -106,9 +94,9 @@ class Access:
             "policies": [{"rules": [r.id for r in group], "subjects": [names[0]]} for group, names in groups.items()],
         }
         rates = [{"key_expr": robot_key("*", "*", what), "freq": hz} for what, hz in _MOST_HZ.items()]
-        reports = {"id": "reports", "flows": [Direction.IN], "messages": [Act.PUT]}
+        reports = {"id": "reports", "flows": ["ingress"], "messages": ["put"]}
         report_bytes = {"key_exprs": [robot_key("*", "*", "*")], "size_limit": _REPORT_BYTES}
-        questions = {"id": "questions", "flows": [Direction.IN], "messages": [Act.QUERY]}
+        questions = {"id": "questions", "flows": ["ingress"], "messages": ["query"]}
         question_bytes = {"key_exprs": ["fleetmap/**"], "size_limit": _QUESTION_BYTES}
         return {
             "access_control": access,
@@ -119,7 +107,7 @@ class Access:
 
 def _rules(holder: Holder) -> tuple[Rule, ...]:
     if holder.purpose is Purpose.SURVEY:
-        return (Rule("survey-says", Direction.IN, (Act.PUT,), ("fleetmap/*/live/survey",)),)
+        return (Rule("survey-says", "ingress", ("put",), ("fleetmap/*/live/survey",)),)
 
     def own(whats: Iterable[str]) -> tuple[str, ...]:
         return tuple(robot_key(holder.site, holder.robot, what) for what in whats)
@@ -129,16 +117,16 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
     if holder.purpose is Purpose.ENROL:
         renew = own(("renew",))
         return (
-            Rule(f"{name}-enrols", Direction.IN, (Act.QUERY,), renew),
-            Rule(f"{name}-enrolled", Direction.OUT, (Act.REPLY,), renew),
+            Rule(f"{name}-enrols", "ingress", ("query",), renew),
+            Rule(f"{name}-enrolled", "egress", ("reply",), renew),
         )
     questions = own((*QUESTIONS, *(f"{what}/*" for what in MAP_PARTS)))
     questions += tuple(robot_key(floor, holder.robot, f"{what}/*") for floor in holder.floors for what in MAP_PARTS)
     return (
-        Rule(f"{name}-asks", Direction.IN, (Act.QUERY,), questions),
-        Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), questions),
-        Rule(f"{name}-reports", Direction.IN, (Act.PUT,), own(REPORTS)),
-        Rule(f"{name}-listens", Direction.IN, (Act.SUBSCRIBE,), own(ORDERS)),
-        Rule(f"{name}-ordered", Direction.OUT, (Act.PUT,), own(ORDERS)),
-        Rule(f"{name}-alive", Direction.IN, (Act.SHOW_ALIVE,), own(ALIVE)),
+        Rule(f"{name}-asks", "ingress", ("query",), questions),
+        Rule(f"{name}-told", "egress", ("reply",), questions),
+        Rule(f"{name}-reports", "ingress", ("put",), own(REPORTS)),
+        Rule(f"{name}-listens", "ingress", ("declare_subscriber",), own(ORDERS)),
+        Rule(f"{name}-ordered", "egress", ("put",), own(ORDERS)),
+        Rule(f"{name}-alive", "ingress", ("liveliness_token",), own(ALIVE)),
     )

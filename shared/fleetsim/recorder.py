@@ -148,7 +148,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         for world in worlds
     ]
     renderer.above = list(zip([end_s for _, end_s in rides_s], above, strict=True))
-    wheel = measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
+    wheel = measure_wheels(motion, kind.body_height_m, _generator(order, name, "wheels"))
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
     # Exact poses at every frame and each 20 ms

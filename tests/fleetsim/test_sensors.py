@@ -10,7 +10,7 @@ from fleetsim.motion.body_motion import RouteMotion, Shake
 from fleetsim.motion.routes import Limits, Route
 from fleetsim.sensors.faults import FAULTS, Fault, FaultPlan, parse_fault
 from fleetsim.sensors.measurements import START_NS, measure_imu, measure_priors, measure_wheels
-from fleetsim.sensors.robots import ImuErrors, WheelErrors
+from fleetsim.sensors.robots import ImuErrors
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def test_imu_noise_and_walk_have_the_stated_density() -> None:
 
 def test_wheels_report_the_base_and_not_the_slip() -> None:
     motion = _motion()
-    samples = measure_wheels(motion, 0.25, WheelErrors(), np.random.default_rng(3))
+    samples = measure_wheels(motion, 0.25, np.random.default_rng(3))
     times = np.array([sample.stamp_ns - START_NS for sample in samples]) * 1e-9
     forward = np.array([sample.velocity_base_mps[0] for sample in samples])
     assert all(sample.velocity_base_mps[1] == 0.0 for sample in samples)

@@ -189,18 +189,15 @@ def check_imu_units(imu: ImuSamples, where: str) -> None:
             "multiply it by 9.80665"
         )
     rate = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 99))
-    if rate > _FASTEST_GYRO_RADPS or _accelerometer_prefers_degrees(imu):
+    errors_rad = gravity_direction_errors_rad(imu, 1.0)
+    is_off = len(errors_rad) >= 4 and np.median(errors_rad) >= np.radians(10)
+    if rate > _FASTEST_GYRO_RADPS or (
+        is_off and np.median(errors_rad) > 4 * np.median(gravity_direction_errors_rad(imu, np.pi / 180))
+    ):
         raise RecordingError(
             f"{where}: the gyro seems to be in degrees per second (99 % of the rates are below {rate:.1f} where rad/s "
             "are expected, and the accelerometer does not see such turns); multiply it by pi/180"
         )
-
-
-def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
-    as_radians = gravity_direction_errors_rad(imu, 1.0)
-    if len(as_radians) < 4 or np.median(as_radians) < np.radians(10):
-        return False
-    return bool(np.median(as_radians) > 4 * np.median(gravity_direction_errors_rad(imu, np.pi / 180)))
 
 
 def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:

@@ -11,7 +11,6 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array
 
 _ITERATIONS = 20
-Lens = tuple[float, float, float, float, float, float, float, float]  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
 class CameraModel:
@@ -67,19 +66,13 @@ class RadialTangential(CameraModel):
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def core_lens(self, distortion: Array) -> tuple[Array, float]:
-        lens = _coefficients(distortion)
-        return np.array(lens), _radial_limit(lens)
-
-
-def _coefficients(distortion: Array) -> Lens:
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(np.asarray(distortion, np.float64), (0, 8 - len(distortion))).tolist()
-    return k1, k2, p1, p2, k3, k4, k5, k6
+        lens = np.pad(np.asarray(distortion, np.float64), (0, 8 - len(distortion)))
+        return lens, _radial_limit(*lens.tolist())
 
 
 @lru_cache(maxsize=16)
-def _radial_limit(lens: Lens) -> float:
+def _radial_limit(k1: float, k2: float, _p1: float, _p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
     """Largest r^2 up to which the distorted radius still grows; beyond it the image folds back. The same in every frame."""
-    k1, k2, _, _, k3, k4, k5, k6 = lens
     above, below = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([k6, k5, k4, 1.0])
     # d/dr of r above(r^2) / below(r^2), times below^2, as a polynomial in r^2
     slope = above * below + np.poly1d([2.0, 0.0]) * (above.deriv() * below - above * below.deriv())

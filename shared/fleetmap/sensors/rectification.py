@@ -189,7 +189,9 @@ class Rectifier:
             tables, shows_robot = _remap_tables(self.camera, camera.model, size_px, *lens, camera.mask)
             self._maps.append(tables)
             hidden.append(shows_robot)
-        self.camera = replace(self.camera, clearance_px=_clearance_px(hidden[0]))
+        if hidden[0] is not None and hidden[0].any():
+            distances = cv2.distanceTransform((~hidden[0]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            self.camera = replace(self.camera, clearance_px=np.minimum(distances, 255).astype(np.uint8))
 
     def _of_view(self, calibration: RigCalibration, numbers: tuple[int, ...]) -> "Rectifier":
         """The rectifier of another view: to the same pinhole, if its focal length allows."""
@@ -304,10 +306,3 @@ def _remap_tables(
     is_inside = ((nearest >= 0) & (nearest < size_px)).all(axis=2)
     indices = np.where(is_inside, nearest @ np.array([1, size_px[0]]), -1).astype(np.int32)
     return (core.Remap(whole, parts, size_px[1], size_px[0]), indices), hidden
-
-
-def _clearance_px(hidden: NDArray[np.bool_] | None) -> Image | None:
-    if hidden is None or not hidden.any():
-        return None
-    distances = cv2.distanceTransform((~hidden).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.minimum(distances, 255).astype(np.uint8)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetsim.motion.routes import Limits, Route, TimedPath, time_path
+from fleetsim.motion.routes import Limits, Route, time_path
 
 DEGREE = 5
 
@@ -50,9 +50,9 @@ class RouteMotion:
     """A route as driven by a body at `height_m` above the ground."""
 
     def __init__(self, route: Route, limits: Limits, height_m: float, shake: Shake, rng: np.random.Generator) -> None:
-        path = time_path(route, limits)
-        self.duration_s = float(path.times_s[-1])  # from the first to the last moment of rest
-        self._control = _control_points(path, height_m, shake, rng)
+        times_s, places_map = time_path(route, limits)
+        self.duration_s = float(times_s[-1])  # from the first to the last moment of rest
+        self._control = _control_points(times_s, places_map, height_m, shake, rng)
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4)."""
@@ -168,12 +168,14 @@ Motion = RouteMotion | CarriedMotion
 """Exact pose, rates and forces of the body at times (N,) in seconds from the start, of `duration_s` in all."""
 
 
-def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:
+def _control_points(
+    times_s: Array, places_map: Array, height_m: float, shake: Shake, rng: np.random.Generator
+) -> Array:
     """(K, 6) each _KNOT_S from 6 knots before the start: the path, ground ripple with speed, squat, lean."""
-    moments = np.arange(-6, int(np.ceil(path.times_s[-1] / _KNOT_S)) + 7) * _KNOT_S
+    moments = np.arange(-6, int(np.ceil(times_s[-1] / _KNOT_S)) + 7) * _KNOT_S
     control = np.zeros((len(moments), 6))
-    for column, source in ((0, path.points_map[:, 0]), (1, path.points_map[:, 1]), (3, path.yaw_rad)):
-        control[:, column] = np.interp(moments, path.times_s, source)
+    for column, values in zip((0, 1, 3), places_map.T, strict=True):
+        control[:, column] = np.interp(moments, times_s, values)
     velocity = np.gradient(control[:, :2], _KNOT_S, axis=0)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     ripple = rng.standard_normal((len(moments), 3)) * np.clip(speed / 1.5, 0.0, 1.0)[:, None]

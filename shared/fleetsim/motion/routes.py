@@ -36,15 +36,6 @@ class Route:
     rest_s: float = 1.5
 
 
-@dataclass(frozen=True, slots=True)
-class TimedPath:
-    """A route as driven: times_s (N,) from 0, points_map (N, 2), yaw_rad (N,) unwrapped."""
-
-    times_s: Array
-    points_map: Array
-    yaw_rad: Array
-
-
 def _corner_arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
     """(K, 2) points of the arc that replaces a corner; (1, 2) the corner itself where the way goes straight on."""
     back, ahead = before - corner, after - corner
@@ -67,8 +58,11 @@ def _corner_arc(before: Array, corner: Array, after: Array, radius_m: float) -> 
     )
 
 
-def time_path(route: Route, limits: Limits) -> TimedPath:
-    """The route within the limits: rest, drive, stops, rest. Speeds by a forward and a backward sweep over the path."""
+def time_path(route: Route, limits: Limits) -> tuple[Array, Array]:
+    """The route within the limits: rest, drive, stops, rest; times (N,) from 0, and x, y and unwrapped yaw in map (N, 3) at each.
+
+    Speeds by a forward and a backward sweep over the path.
+    """
     way_points = np.array(route.way_points_map, np.float64)
     pieces = [way_points[:1]]
     for before, corner, after in zip(way_points[:-2], way_points[1:-1], way_points[2:], strict=True):
@@ -100,9 +94,9 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
     times = np.cumsum(durations)
     held = np.array(sorted(stops), np.int64)
     times_held = np.insert(times, held, times[held] - np.array([stops[int(index)] for index in held], np.float64))
-    points_held, yaw_held = np.insert(points, held, points[held], axis=0), np.insert(yaw, held, yaw[held])
-    whole = np.concatenate([[0.0], times_held, [times_held[-1] + route.rest_s]])
-    return TimedPath(whole, np.pad(points_held, ((1, 1), (0, 0)), "edge"), np.pad(yaw_held, 1, "edge"))
+    places = np.column_stack([points, yaw])
+    places = np.pad(np.insert(places, held, places[held], axis=0), ((1, 1), (0, 0)), "edge")
+    return np.concatenate([[0.0], times_held, [times_held[-1] + route.rest_s]]), places
 
 
 def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:

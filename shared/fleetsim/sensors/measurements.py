@@ -7,9 +7,11 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, WheelSample
 from fleetsim.motion.body_motion import Motion
-from fleetsim.sensors.robots import ImuErrors, WheelErrors
+from fleetsim.sensors.robots import ImuErrors
 
 _DEPTH_BASE_M, _DEPTH_SIGMA_PX, _DEPTH_RANGE_M = 0.05, 0.08, (0.3, 10.0)
+# Wheel odometry: rate, scale errors' rms per robot, noise per sample; sideways slip is in the motion already
+_WHEEL_HZ, _SPEED_SCALE, _YAW_SCALE, _WHEEL_NOISE_MPS, _WHEEL_NOISE_RADPS = 50.0, 0.005, 0.01, 0.01, 0.005
 START_NS = 1_700_000_000_000_000_000  # the sensor clock at the start of every recording
 
 
@@ -56,22 +58,20 @@ def measure_depth(
     return (np.rint(np.where(is_seen, noisy, 0.0) * 1000.0) / 1000.0).astype(np.float32)
 
 
-def measure_wheels(
-    motion: Motion, height_m: float, errors: WheelErrors, rng: np.random.Generator
-) -> tuple[WheelSample, ...]:
+def measure_wheels(motion: Motion, height_m: float, rng: np.random.Generator) -> tuple[WheelSample, ...]:
     """Wheel odometry of the base, height_m straight below the body: scale errors of this robot, noise per sample.
 
     Wheels cannot measure sideways slip: they always report 0 to the left.
     """
-    times = sample_times(motion.duration_s, errors.rate_hz)
+    times = sample_times(motion.duration_s, _WHEEL_HZ)
     velocity, (gyro, _) = motion.velocity_body(times), motion.rates(times)
     forward = velocity[:, 0] - gyro[:, 1] * height_m
-    speed_scale, yaw_scale = 1.0 + rng.normal(0.0, 1.0, 2) * (errors.speed_scale, errors.yaw_scale)
+    speed_scale, yaw_scale = 1.0 + rng.normal(0.0, 1.0, 2) * (_SPEED_SCALE, _YAW_SCALE)
     noise = rng.standard_normal((len(times), 2)) * np.where((np.abs(forward) < 1e-3)[:, None], 0.0, 1.0)
-    speeds = forward * speed_scale + noise[:, 0] * errors.noise_mps
-    turns = gyro[:, 2] * yaw_scale + noise[:, 1] * errors.noise_radps
-    sigma_mps = float(np.hypot(errors.noise_mps, errors.speed_scale))
-    sigma_radps = float(np.hypot(errors.noise_radps, errors.yaw_scale * 0.5))
+    speeds = forward * speed_scale + noise[:, 0] * _WHEEL_NOISE_MPS
+    turns = gyro[:, 2] * yaw_scale + noise[:, 1] * _WHEEL_NOISE_RADPS
+    sigma_mps = float(np.hypot(_WHEEL_NOISE_MPS, _SPEED_SCALE))
+    sigma_radps = float(np.hypot(_WHEEL_NOISE_RADPS, _YAW_SCALE * 0.5))
     return tuple(
         WheelSample(int(stamp), np.array([speed, 0.0, 0.0]), float(turn), sigma_mps, sigma_radps)
         for stamp, speed, turn in zip(stamps_from_s(times), speeds, turns, strict=True)

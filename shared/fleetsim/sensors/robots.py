@@ -37,17 +37,6 @@ class ImuErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class WheelErrors:
-    """Wheel odometry: scale errors' rms per robot, noise per sample, sideways slip is in the motion already."""
-
-    speed_scale: float = 0.005
-    yaw_scale: float = 0.01
-    noise_mps: float = 0.01
-    noise_radps: float = 0.005
-    rate_hz: float = 50.0
-
-
-@dataclass(frozen=True, slots=True)
 class HiddenErrors:
     """Errors that the calibration does not contain.
 
@@ -101,7 +90,6 @@ class RobotKind:
     rig: str = "pair"
     clearance_m: float = 0.3
     imu: ImuErrors = field(default_factory=ImuErrors)
-    wheels: WheelErrors = field(default_factory=WheelErrors)
     hidden: HiddenErrors = field(default_factory=HiddenErrors)
 
 

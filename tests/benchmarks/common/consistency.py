@@ -71,7 +71,7 @@ class Site:
             self._base, order=replace(self._base.order, seed=seed, robot=name), nominal=nominal_calibration(kind),
             true=true_calibration(kind, rng), motion=motion, frame_times_s=tuple(times),
             imu=plan.spoil_imu(measure_imu(motion, kind.imu, rng)),
-            wheel=plan.spoil_wheels(measure_wheels(motion, kind.body_height_m, kind.wheels, rng)), priors=(),
+            wheel=plan.spoil_wheels(measure_wheels(motion, kind.body_height_m, rng)), priors=(),
         )  # fmt: skip
         made = EstimatorSession(session, field=self._field)
         made.stamps_ns = [stamp_ns - int(camera_delay_s * 1e9) for stamp_ns in made.stamps_ns]

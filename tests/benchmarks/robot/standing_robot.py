@@ -52,5 +52,5 @@ def standing(drive: Session, time_s: float, number: int, duration_s: float, rate
         renderer=RigRenderer(drive.world, drive.true, motion, light=order.light, key=number),
         frame_times_s=tuple(float(t) for t in sample_times(duration_s, rate_hz)),
         imu=measure_imu(motion, kind.imu, rng),
-        wheel=measure_wheels(motion, kind.body_height_m, kind.wheels, rng),
+        wheel=measure_wheels(motion, kind.body_height_m, rng),
     )

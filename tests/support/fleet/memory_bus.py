@@ -66,11 +66,11 @@ class MemoryBus(Bus):
                 answer
                 for key_expr, answer, other in hub.queryables
                 if key_includes(key_expr, key)
-                and hub.passes(other, Direction.IN, Act.ANSWER, key_expr)
-                and hub.passes(other, Direction.OUT, Act.QUERY, key)
-                and hub.passes(other, Direction.IN, Act.REPLY, key)
+                and hub.passes(other, "ingress", "declare_queryable", key_expr)
+                and hub.passes(other, "egress", "query", key)
+                and hub.passes(other, "ingress", "reply", key)
             ]
-        may_ask = hub.passes(own, Direction.IN, Act.QUERY, key) and hub.passes(own, Direction.OUT, Act.REPLY, key)
+        may_ask = hub.passes(own, "ingress", "query", key) and hub.passes(own, "egress", "reply", key)
         if not hub.reachable or not answers or not may_ask:
             raise no_answer(key, self.endpoint, timeout_s, is_silenced=hub.access is not None and own is not None)
         data, reason = answer_query(answers[0], key, payload)
@@ -86,10 +86,10 @@ class MemoryBus(Bus):
                 listen
                 for key_expr, listen, other in hub.subscribers
                 if key_includes(key_expr, key)
-                and hub.passes(other, Direction.IN, Act.SUBSCRIBE, key_expr)
-                and hub.passes(other, Direction.OUT, Act.PUT, key)
+                and hub.passes(other, "ingress", "declare_subscriber", key_expr)
+                and hub.passes(other, "egress", "put", key)
             ]
-        if hub.reachable and hub.passes(self._certificate, Direction.IN, Act.PUT, key):
+        if hub.reachable and hub.passes(self._certificate, "ingress", "put", key):
             for listen in listeners:
                 deliver(listen, key, payload)
 
@@ -101,10 +101,10 @@ class MemoryBus(Bus):
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
         hub = self._hub
-        if not hub.reachable or not hub.passes(self._certificate, Direction.IN, Act.LOOK_FOR_ALIVE, key_expr):
+        if not hub.reachable or not hub.passes(self._certificate, "ingress", "liveliness_query", key_expr):
             return []
         with hub.lock:
-            shown = {key for key, other in hub.tokens if hub.passes(other, Direction.IN, Act.SHOW_ALIVE, key)}
+            shown = {key for key, other in hub.tokens if hub.passes(other, "ingress", "liveliness_token", key)}
         return sorted(key for key in shown if key_includes(key_expr, key))
 
     def reopen(self, access: Access) -> None:
