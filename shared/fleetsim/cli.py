@@ -71,7 +71,7 @@ def record(
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.recorder import Order, record_order
-    from fleetsim.sensors.faults import parse_fault
+    from fleetsim.sensors.measurements import parse_fault
     from fleetsim.sensors.robots import HiddenErrors
 
     order = Order(

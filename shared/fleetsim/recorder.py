@@ -18,15 +18,16 @@ from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
 from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
-from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
-from fleetsim.motion.routes import check_clear
+from fleetsim.motion import CarriedMotion, Motion, RouteMotion, check_clear
 from fleetsim.render.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES
 from fleetsim.scene.world import World
-from fleetsim.sensors.faults import LATE_S, Fault, FaultPlan
 from fleetsim.sensors.measurements import (
+    LATE_S,
+    Fault,
+    FaultPlan,
     measure_depth,
     measure_imu,
     measure_priors,

@@ -6,10 +6,10 @@ from math import pi
 import msgspec
 
 from fleetmap.errors import chosen
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover, patrol
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from fleetsim.sensors.robots import ROBOTS, RobotKind
 
 

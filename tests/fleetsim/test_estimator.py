@@ -11,7 +11,7 @@ from fleetmap.geometry import se3_inverse, transform_points
 from fleetsim.recorder import Order, prepare
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import World
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from fleetsim.sensors.robots import HiddenErrors
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Smudge

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetsim.motion.body_motion import GRAVITY_MPS2, LIFT_M, LIFT_S, STOREY_M, CarriedMotion, RouteMotion, Shake
-from fleetsim.motion.routes import Limits, Route, check_clear, time_path
+from fleetsim import motion as motions
+from fleetsim.motion import CarriedMotion, Limits, Route, RouteMotion, Shake, check_clear, time_path
 from fleetsim.recorder import Order, drive, prepare
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.scene.layout import Layout
@@ -51,7 +51,7 @@ def test_a_lift_takes_a_robot_up_a_storey_in_the_dark_to_another_hall() -> None:
         assert isinstance(session.motion, CarriedMotion)
         ((start_s, end_s),) = session.motion.rides_s
         heights_m = session.motion.map_from_body(np.array([start_s, end_s - 1e-6, end_s]))[:, 2, 3]
-        np.testing.assert_allclose(np.diff(heights_m), [STOREY_M, -STOREY_M], atol=2e-3)
+        np.testing.assert_allclose(np.diff(heights_m), [motions.STOREY_M, -motions.STOREY_M], atol=2e-3)
         assert session.renderer.faults.has("camera-dark", end_s - 0.1)
         assert not session.renderer.faults.has("camera-dark", end_s)
         ((from_s, above),) = session.renderer.above
@@ -62,17 +62,17 @@ def test_a_lift_takes_a_robot_up_a_storey_in_the_dark_to_another_hall() -> None:
 def test_a_carried_robot_is_lifted_between_its_rests_and_feels_it() -> None:
     first, second = _motion(), _motion(Route(((5.0, 5.0), (9.0, 5.0))))
     carried = CarriedMotion([first, second])
-    times = first.duration_s + np.arange(0.0, 2.0 * LIFT_S, 0.001)
+    times = first.duration_s + np.arange(0.0, 2.0 * motions.LIFT_S, 0.001)
     places, (_, force) = carried.map_from_body(times), carried.rates(times)
     jumps_m = np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1)
-    assert np.argmax(jumps_m) == LIFT_S * 1000 - 1
+    assert np.argmax(jumps_m) == motions.LIFT_S * 1000 - 1
     assert jumps_m.max() > 1.0
     assert np.sort(jumps_m)[-2] < 0.002
     heights_m = places[:, 2, 3] - places[0, 2, 3]
     np.testing.assert_allclose(heights_m[[0, -1]], 0.0, atol=1e-3)
-    assert heights_m.max() == pytest.approx(LIFT_M, abs=1e-3)
+    assert heights_m.max() == pytest.approx(motions.LIFT_M, abs=1e-3)
     by_differences = np.gradient(np.gradient(heights_m, 0.001), 0.001)
-    felt = np.einsum("ni,ni->n", places[:, 2, :3], force) - GRAVITY_MPS2
+    felt = np.einsum("ni,ni->n", places[:, 2, :3], force) - motions.GRAVITY_MPS2
     np.testing.assert_allclose(felt[2:-2], by_differences[2:-2], atol=0.05)
     np.testing.assert_allclose(carried.velocity_body(times), 0.0, atol=0.01)
 

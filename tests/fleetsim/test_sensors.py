@@ -6,10 +6,9 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
 from fleetmap.sensors.samples import ImuSamples
-from fleetsim.motion.body_motion import RouteMotion, Shake
-from fleetsim.motion.routes import Limits, Route
-from fleetsim.sensors.faults import FAULTS, Fault, FaultPlan, parse_fault
-from fleetsim.sensors.measurements import START_NS, measure_imu, measure_priors, measure_wheels
+from fleetsim.motion import Limits, Route, RouteMotion, Shake
+from fleetsim.sensors import measurements
+from fleetsim.sensors.measurements import START_NS, Fault, FaultPlan, measure_imu, measure_priors, measure_wheels
 from fleetsim.sensors.robots import ImuErrors
 
 Array = NDArray[np.float64]
@@ -87,9 +86,9 @@ def test_imu_gap_and_spike() -> None:
     assert np.abs(samples.accel_mps2).max() < 40
 
 
-@pytest.mark.parametrize("name", list(FAULTS))
+@pytest.mark.parametrize("name", list(measurements.FAULTS))
 def test_every_fault_can_be_asked_for(name: str) -> None:
-    assert parse_fault(f"{name}@8+2.5") == Fault(name, 8.0, 10.5)
+    assert measurements.parse_fault(f"{name}@8+2.5") == Fault(name, 8.0, 10.5)
 
 
 @pytest.mark.parametrize(
@@ -97,4 +96,4 @@ def test_every_fault_can_be_asked_for(name: str) -> None:
 )
 def test_nonsense_faults_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="fault"):
-        parse_fault(text)
+        measurements.parse_fault(text)

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetsim.motion.body_motion import RouteMotion
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route, RouteMotion
 from fleetsim.render.optics import make_optics
-from fleetsim.render.painter import Painter
-from fleetsim.render.renderer import RigRenderer
+from fleetsim.render.renderer import Painter, RigRenderer
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import Exposure
 from fleetsim.scene.world import World

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from fleetsim.scene.layout import Layout
-from fleetsim.scene.stock import Slot, last_restock_day, slot_generator
+from fleetsim.scene.layout import Layout, Slot, last_restock_day, slot_generator
 from fleetsim.scene.world import World
 
 

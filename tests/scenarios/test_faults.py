@@ -12,9 +12,9 @@ import pytest
 from benchmarks.common import estimator_loop
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.map_view import MapView
-from fleetsim.motion.body_motion import LIFT_S
+from fleetsim.motion import LIFT_S
 from fleetsim.recorder import Order, Session, prepare
-from fleetsim.sensors.faults import Fault, FaultPlan
+from fleetsim.sensors.measurements import Fault, FaultPlan
 from locclient.localization.estimate import Estimate
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession

@@ -14,11 +14,11 @@ from rich.console import Console
 from benchmarks.common.recorded_runs import SITE, mapped, played
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.replay import run_metrics

@@ -1,21 +1,133 @@
-"""A rig's renderer: one thread per camera, exposure, image faults."""
+"""A rig's renderer, one thread per camera: from a scene and each camera's way through the exposure to pictures and their exact depth."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap import core
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import Image
-from fleetsim.motion.body_motion import Motion
-from fleetsim.render.optics import make_optics
-from fleetsim.render.painter import Painter, Shot
-from fleetsim.scene.light import LIGHT_STATES, Exposure, auto_exposure
-from fleetsim.scene.movers import Mover
-from fleetsim.scene.stock import mix
-from fleetsim.scene.world import World
-from fleetsim.sensors.faults import OVER_EXPOSURE, Fault, FaultPlan
+from fleetsim.motion import Motion
+from fleetsim.render.optics import Optics, make_optics
+from fleetsim.scene.layout import mix
+from fleetsim.scene.light import GREY_PER_MS, LIGHT_STATES, Exposure, auto_exposure, sensor_noise_of
+from fleetsim.scene.movers import Mover, add_movers, mover_light
+from fleetsim.scene.world import Scene, World
+from fleetsim.sensors.measurements import OVER_EXPOSURE, Fault, FaultPlan
+
+Path = Callable[[float], Array]  # t_s -> map_from_cam
+# One of an exposure: samples per pixel side, their shift in pixels, weight in the picture.
+_Instant = tuple[int, tuple[float, float], float]
+_Canvas = tuple[Array, NDArray[np.float32]]  # a picture in the making (H, W): radiance, depth
+_BLUR_STEP_PX, _MOST_SUBFRAMES, _NEAR_THINGS_M = 1.2, 8, 1.5
+_R2_SEQUENCE = np.array([0.7548776662, 0.5698402910])
+_NOISE_TABLE = 1 << 18
+_SHARP_SAMPLES = 2  # per pixel side, for the edges of sharp pictures
+_MOST_TAPS = 4
+_REFLECTANCE = 0.06  # of the ground seen from above
+
+
+class Shot(NamedTuple):
+    """A picture with its truth at mid exposure.
+
+    depth_m (H, W): along the optical axis, 0 for nothing. Of a fisheye on several planes, of that in front.
+    """
+
+    image: Image
+    depth_m: NDArray[np.float32]
+
+
+class Painter:
+    """Holds one camera's buffers; not for several threads."""
+
+    def __init__(
+        self,
+        world: World,
+        optics: Optics,
+        number: int,
+        movers: tuple[Mover, ...] = (),
+        *,
+        has_blur: bool = True,
+        has_noise: bool = True,
+    ) -> None:
+        self._world, self._optics, self._number, self._movers = world, optics, number, movers
+        self._has_blur, self._has_noise = has_blur, has_noise
+        self._scene: Scene | None = None
+        self._groups = np.zeros(3)
+        self._scenes = [core.ScenePainter(plane.pinhole, plane.rays) for plane in optics.planes]
+        self._normals = np.random.default_rng(99).standard_normal(_NOISE_TABLE).astype(np.float32)
+
+    def shoot(self, scene: Scene, groups: Array, path: Path, t_s: float, exposure: Exposure, noise_key: int) -> Shot:
+        """The picture whose exposure is centred at t; `groups` are the strengths of the lamp groups."""
+        self._prepare(scene, groups, t_s)
+        shape = self._optics.vignetting.shape
+        radiance, depth_m = np.zeros(shape), np.zeros(shape, np.float32)
+        count = self._subframes(path, t_s, exposure) if self._has_blur else 1
+        samples = _SHARP_SAMPLES if count == 1 else 1
+        for number in range(count):
+            moment = t_s + ((number + 0.5) / count - 0.5) * exposure.time_s
+            # Sub-pixel shifts of a low-discrepancy sequence smooth the edges of blurred pictures at no cost.
+            shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
+            instant = samples, (float(shift[0]), float(shift[1])), 1.0 / count
+            self._add((radiance, depth_m), instant, path(moment), moment, wants_truth=number == count // 2)
+        shot, read = sensor_noise_of(exposure.gain) if self._has_noise else (0.0, 0.0)
+        noise = (shot, read, self._normals, noise_key * 2 + self._number)
+        grey_per_radiance = GREY_PER_MS * 1e3 * exposure.time_s * exposure.gain
+        image = core.develop(radiance, grey_per_radiance, *noise, self._optics.vignetting)
+        return Shot(image, depth_m)
+
+    def _subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
+        """Number of pictures to average so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
+        before, after = path(t_s - exposure.time_s / 2), path(t_s + exposure.time_s / 2)
+        turned = float(np.linalg.norm(before[:3, :3].T @ after[:3, :3] - np.eye(3))) / np.sqrt(2.0)
+        moved = float(np.linalg.norm(after[:3, 3] - before[:3, 3])) / _NEAR_THINGS_M
+        wanted = np.ceil(self._optics.planes[0].pinhole[0] * (turned + moved) / _BLUR_STEP_PX)
+        return int(np.clip(wanted, 1, _MOST_SUBFRAMES))
+
+    def _prepare(self, scene: Scene, groups: Array, t_s: float) -> None:
+        """Own copies of the scene's columns with room for the movers at the end; light for this moment."""
+        if self._scene is not scene or not np.array_equal(self._groups, groups):
+            builder = self._world.builder()
+            add_movers(builder, self._movers, self._world.textures, t_s)
+            self._mover_faces = builder.finish()
+            moving, first_sample = self._mover_faces, scene.light.shape[1]
+            numbers = moving.numbers.copy()
+            numbers[:, 3] += first_sample
+            self._quads = np.concatenate([scene.quads, moving.quads])
+            self._values = np.concatenate([scene.values, moving.values])
+            self._numbers = np.concatenate([scene.numbers, numbers])
+            last = len(scene.quads)
+            self._ranges = np.concatenate([scene.ranges, np.array([[last, last + len(moving)]], np.int32)])
+            self._bounds = np.concatenate([scene.bounds_m, np.array([[-1e5, -1e5, -1e5, 1e5, 1e5, 1e5]])])
+            mixed = groups.astype(np.float32) @ scene.light + np.float32(self._world.lamps.ambient(groups))
+            self._light = np.concatenate([mixed, np.zeros(moving.light_samples, np.float32)])
+            self._scene, self._groups = scene, groups.copy()
+        if self._movers:
+            places = [mover.place(t_s) for mover in self._movers]
+            floor_light = [self._world.lamps.floor_light(groups, x, y) for x, y, _ in places]
+            self._light[scene.light.shape[1] :] = mover_light(self._mover_faces, self._movers, floor_light, t_s)
+
+    def _add(self, canvas: _Canvas, instant: _Instant, map_from_cam: Array, t_s: float, *, wants_truth: bool) -> None:
+        shadows = np.zeros((0, 3))  # of the movers, which stand at their places at time t now
+        if self._movers:
+            builder = self._world.builder()
+            shadows = add_movers(builder, self._movers, self._world.textures, t_s)
+            self._quads[-len(self._mover_faces) :] = builder.finish().quads
+        cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
+        centre, world, atlas = np.ascontiguousarray(map_from_cam[:3, 3]), self._world, self._world.textures.atlas
+        faces = (self._quads, self._values, self._numbers, self._light, self._groups)
+        textures = (atlas.texels, atlas.table, world.decals, world.floor_numbers)
+        chunks, look = (self._ranges, self._bounds), (_MOST_TAPS, _REFLECTANCE, shadows)
+        for number, (plane, painter) in enumerate(zip(self._optics.planes, self._scenes, strict=True)):
+            plane_from_map = np.ascontiguousarray(plane.cam_from_plane.T @ cam_from_map)
+            # The truth is that of the plane in front: depths of the others are along other axes
+            wanted = wants_truth and number == 0
+            painter.add(faces, chunks, textures, plane_from_map, centre, *instant, *look, wanted, *canvas)
+
 
 _PERSON_AHEAD_M = 0.8
 

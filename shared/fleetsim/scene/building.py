@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetsim.scene.faces import MATERIAL_FLOOR, MATERIAL_LAMP, NO_BOTTOM, FaceBuilder, Surface
-from fleetsim.scene.layout import Layout, Rectangle
-from fleetsim.scene.stock import mix
+from fleetsim.scene.layout import Layout, Rectangle, mix
 from fleetsim.textures.atlas import TEXEL_M
 from fleetsim.textures.painting import MARGIN_SHARE
 from fleetsim.textures.texture_set import Textures

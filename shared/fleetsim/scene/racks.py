@@ -3,8 +3,7 @@
 import numpy as np
 
 from fleetsim.scene.faces import NO_BOTTOM, FaceBuilder, Surface
-from fleetsim.scene.layout import Layout
-from fleetsim.scene.stock import Slot, mix, slot_generator
+from fleetsim.scene.layout import Layout, Slot, mix, slot_generator
 from fleetsim.textures.texture_set import RACK_LABELS, Sku, Textures
 
 _TAG_RACK, _TAG_LABEL = 31, 32

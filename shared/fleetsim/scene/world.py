@@ -15,10 +15,9 @@ from fleetmap import core
 from fleetmap.geometry import Array
 from fleetsim.scene.building import HallMaker
 from fleetsim.scene.faces import FaceBuilder, Faces
-from fleetsim.scene.layout import Layout
+from fleetsim.scene.layout import Layout, mix
 from fleetsim.scene.light import LAMP_REACH_M, LampField
 from fleetsim.scene.racks import RackMaker
-from fleetsim.scene.stock import mix
 from fleetsim.textures.texture_set import paint_textures
 
 LAMP_GROUPS = 3

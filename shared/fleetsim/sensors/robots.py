@@ -8,8 +8,7 @@ import numpy as np
 from fleetmap.errors import chosen
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
-from fleetsim.motion.body_motion import Shake
-from fleetsim.motion.routes import Limits
+from fleetsim.motion import Limits, Shake
 
 _BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looking along body x
 # Model, distortion, focal length as a share of the image width.

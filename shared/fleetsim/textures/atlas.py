@@ -5,8 +5,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetsim.textures.lettering import Texture
-
+Texture = NDArray[np.float32]
 TEXEL_M = 0.0025  # metres per texel: with a 420 px lens one texel is one pixel at 1.05 m
 LEVELS = 12
 

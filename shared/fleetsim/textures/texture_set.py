@@ -7,7 +7,7 @@ import numpy as np
 
 from fleetsim.textures import painting
 from fleetsim.textures.atlas import Atlas
-from fleetsim.textures.lettering import noise
+from fleetsim.textures.painting import noise
 
 SKUS, LABELS, POSTERS, RACK_LABELS = 28, 64, 24, 512
 _DECALS = (("scuffs", 6), ("stains", 3), ("cracks", 4), ("sticker", 6), ("repair", 4))

@@ -10,12 +10,10 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from fleetsim.motion.body_motion import RouteMotion
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route, RouteMotion
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.sensors.faults import Fault, FaultPlan
-from fleetsim.sensors.measurements import START_NS, measure_imu, measure_wheels, sample_times
+from fleetsim.sensors.measurements import START_NS, Fault, FaultPlan, measure_imu, measure_wheels, sample_times
 from fleetsim.sensors.robots import nominal_calibration, true_calibration
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession

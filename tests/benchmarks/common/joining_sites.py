@@ -16,7 +16,7 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import SensorSet
 from fleetsim import recorder
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.world import World
 from mapserver.config import survey_settings

@@ -23,7 +23,7 @@ from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import wheel_between
 from fleetsim import recorder
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.scenarios import SCENARIOS
 from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside

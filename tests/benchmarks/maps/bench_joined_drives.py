@@ -22,7 +22,7 @@ from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout

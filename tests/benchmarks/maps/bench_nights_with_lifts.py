@@ -27,10 +27,10 @@ from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session, record_order
 from fleetsim.scenarios import SCENARIOS, Run
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from fleetsim.sensors.robots import HiddenErrors
 from locclient.replay import run_metrics
 from mapserver.drafting.draft import BuildOptions

@@ -25,7 +25,7 @@ from fleetmap.recordings import open_recording
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from fleetsim.motion.routes import check_clear
+from fleetsim.motion import check_clear
 from fleetsim.recorder import Order, prepare
 from fleetsim.render.renderer import RigRenderer
 from mapserver.quality.probes import Probe, probe_features, relocalized

@@ -25,11 +25,11 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.replay_source import ReplaySource
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from locclient.localization.estimate import Estimate
 from locclient.replay import run_metrics
 from studies.robot_days.drives import judged

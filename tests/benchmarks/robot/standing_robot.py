@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetsim.motion.body_motion import GRAVITY_MPS2
+from fleetsim.motion import GRAVITY_MPS2
 from fleetsim.recorder import Session
 from fleetsim.render.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS
@@ -14,7 +14,7 @@ from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_ti
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """A motion that stands at one place after another, dwell_s at each; see `fleetsim.motion.body_motion.Motion`."""
+    """A motion that stands at one place after another, dwell_s at each; see `fleetsim.motion.Motion`."""
 
     places: Array
     dwell_s: float

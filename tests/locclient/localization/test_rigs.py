@@ -15,7 +15,7 @@ from fleetmap.odometry.modes import InertialMode
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout

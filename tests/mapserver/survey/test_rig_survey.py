@@ -16,7 +16,7 @@ from fleetmap.geometry import Array, se3_inverse, se3_log
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.time_sliced import finished
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS
 from mapserver.config import survey_settings

@@ -9,13 +9,13 @@ import numpy as np
 from benchmarks.common import estimator_loop
 from benchmarks.robot.aliased_starts import RememberingSession, within_budget
 from fleetmap.relocalization.map_view import MapView
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover
 from fleetsim.scene.world import World
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Smudge
 

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from fleetsim.motion.routes import Route
+from fleetsim.motion import Route
 from fleetsim.scene.movers import patrol
-from fleetsim.sensors.faults import Fault
+from fleetsim.sensors.measurements import Fault
 from studies.robot_days.site import LAYOUT, Trip, random_route
 from support.estimator.simulated_run import Smudge
 

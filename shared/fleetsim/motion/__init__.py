@@ -1,1 +1,0 @@
-"""Routes, splines, and motion of a robot's body."""
