@@ -51,7 +51,7 @@ def run(
     from locclient.config import with_insecure
     from locclient.daemon.daemon import check_run, daemon_parts
 
-    settings = with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+    settings = with_insecure(context.obj(config)[0], insecure=insecure)
 
     check_run(settings)
     from locclient.daemon.runtime import Runtime

@@ -37,13 +37,6 @@ class Group(NamedTuple):
 Commands = Mapping[str, Command | Group]
 
 
-class Program(NamedTuple):
-    """A command line; commands find it as `context.obj`."""
-
-    commands: Commands
-    read_config: ReadConfig
-
-
 def expand_options(command: Command) -> Command:
     """Replace the dataclass parameters of a command by their fields, as separate options."""
     groups: dict[str, Any] = {}
@@ -67,7 +60,7 @@ def expand_options(command: Command) -> Command:
 
 
 def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hook: str = "") -> typer.Typer:
-    """Create a program of these commands; `callback` holds its own options, `read_config` serves --config.
+    """Create a program of these commands; `callback` holds its own options, `read_config` serves --config, as `context.obj`.
 
     hook: the group of plug-ins' commands, which are imported when one is called or all are listed: that takes 2 MB.
     """
@@ -86,7 +79,7 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hoo
         def list_commands(self, ctx: Any) -> list[str]:
             return [*super().list_commands(ctx), *self.others]
 
-    settings: dict[str, Any] = {"obj": Program(commands, read_config), "max_content_width": 140}
+    settings: dict[str, Any] = {"obj": read_config, "max_content_width": 140}
     app = typer.Typer(
         cls=WithPlugins,
         no_args_is_help=True,
@@ -169,7 +162,7 @@ def take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     """Callback of --config: make the file's section the command's defaults (before the command: all sections)."""
     if path is None or context.resilient_parsing:
         return path
-    _, sections = context.obj.read_config(path)
+    _, sections = context.obj(path)
     for word in _words(context):
         sections = sections.get(word, {})
     context.default_map = sections
@@ -215,4 +208,4 @@ def config_path(context: typer.Context) -> Path | None:
 
 def settings_of(context: typer.Context) -> Any:
     """Settings of the file that --config named; the defaults without one."""
-    return context.obj.read_config(config_path(context))[0]
+    return context.obj(config_path(context))[0]

@@ -13,7 +13,7 @@ import msgspec
 
 from fleetmap.errors import UsageError
 
-S = TypeVar("S", bound="Section")
+T = TypeVar("T")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 _MAX_FILE_BYTES = 1 << 20
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
@@ -32,19 +32,10 @@ class Setting(NamedTuple):
     value: Any
 
 
-def load_toml(path: Path, section_type: type[S]) -> S:
-    """Load the settings in the file at `path`; missing keys keep their defaults.
-
-    Raises UsageError naming the file and the offending key for unreadable files, unknown keys and wrong types.
-    """
-    settings: S = _decoded(path, section_type)
-    return settings
-
-
 def read_given(path: Path, file_type: type[Section]) -> dict[str, Any]:
     """Return the keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`, and for impossible numbers."""
-    _decoded(path, file_type)
-    given: dict[str, Any] = _decoded(path, dict[str, Any])
+    load_toml(path, file_type)
+    given = load_toml(path, dict[str, Any])
     _check_numbers(path, given)
     return given
 
@@ -58,7 +49,11 @@ def _check_numbers(path: Path, given: Mapping[str, Any], section: str = "") -> N
             raise UsageError(f"configuration file {path}: {section}{key} = {value}: give a finite number, 0 or more")
 
 
-def _decoded(path: Path, kind: Any) -> Any:
+def load_toml(path: Path, kind: type[T]) -> T:
+    """Load the settings in the file at `path` as a section, whose missing keys keep their defaults, or as a dict.
+
+    Raises UsageError naming the file and the offending key for unreadable files, unknown keys and wrong types.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(_MAX_FILE_BYTES + 1)

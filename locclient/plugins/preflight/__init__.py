@@ -18,7 +18,7 @@ def check(
     from locclient.config import with_insecure
     from locclient.plugins.preflight.checks import FAIL, run_preflight
 
-    settings = with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+    settings = with_insecure(context.obj(config)[0], insecure=insecure)
 
     failed = False
     for finding in run_preflight(settings, seconds):

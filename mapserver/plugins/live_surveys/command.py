@@ -86,7 +86,7 @@ def live(
             read, indices = build.opened(recording)
             drive: Drive = RecordedDrive(request, opened.enter_context(read), indices, options.speed)
         else:
-            given = context.obj.read_config(sensors)[0]
+            given = context.obj(sensors)[0]
             drive = SensorDrive(request, open_source(given.source, given.topics), given.topics)
         if options.foxglove is not None:
             viewer = LiveViewer(foxglove, drive)

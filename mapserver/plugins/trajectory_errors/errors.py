@@ -29,14 +29,14 @@ def read_covariances(path: Path) -> StampedCovariances:
     not rise, or a file that cannot be read.
     """
     stamps, covariances = [], []
-    for line in stamped_lines(read_text(path, "covariances as CSV are expected"), str(path)):
-        if len(line.values) != len(_ROWS) or not np.isfinite(line.values).all():
-            raise RecordingError(f"{line.where}: {len(line.values)} numbers after the stamp, 21 finite ones are needed")
+    for where, _, stamp_ns, values in stamped_lines(read_text(path, "covariances as CSV are expected"), str(path)):
+        if len(values) != len(_ROWS) or not np.isfinite(values).all():
+            raise RecordingError(f"{where}: {len(values)} numbers after the stamp, 21 finite ones are needed")
         covariance = np.zeros((6, 6))
-        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = line.values
+        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = values
         if np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise RecordingError(f"{line.where}: the covariance is not positive definite; is its order rotation first?")
-        stamps.append(line.stamp_ns)
+            raise RecordingError(f"{where}: the covariance is not positive definite; is its order rotation first?")
+        stamps.append(stamp_ns)
         covariances.append(covariance)
     return StampedCovariances(np.array(stamps, np.int64), np.array(covariances).reshape(-1, 6, 6))
 

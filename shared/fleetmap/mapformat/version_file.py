@@ -24,7 +24,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError, StoreError, check_format, disk_errors
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, Name, Positive, Sha256, decode_manifest
 from fleetmap.mapformat.names import check_name, verified
@@ -136,10 +136,7 @@ class ExportReader:
         if number < 1 or reserved != 0 or head_bytes > min(_MAX_HEAD_BYTES, self._size):
             raise self._damaged(f"format {number}, head of {head_bytes} bytes")
         body = _START.size + head_bytes
-        try:
-            head = msgspec.json.decode(b"".join(self._span(_START.size, body)), type=ExportHead)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise self._damaged(str(error)) from error
+        head = decode_json(b"".join(self._span(_START.size, body)), ExportHead, str(self._damaged("{}")))
         kinds = [blob.kind for blob in head.blobs]
         if kinds[:1] != ["manifest"] or kinds.count("manifest") != 1 or kinds.count("archive") > 1:
             raise self._damaged("it does not begin with one manifest, or has several archives")

@@ -6,6 +6,7 @@ import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -388,7 +389,12 @@ def _check_file(stored: StoredImage) -> tuple[int, int]:
     data = stored.data
     if not data:
         raise stored.error(f"the image has no bytes; {_REMOVE_IT}")
-    if unread := what_instead(data) or _unread(data, stored.form):
+    unread = what_instead(data)
+    if file_kind(data) == "other" and not unread:  # of a known format that is not supported
+        by_name = (what for word, what in _UNREAD_FORMS.items() if word in stored.form.lower())
+        by_start = (what for start, what in _UNREAD_STARTS if start.match(data))
+        unread = next(chain(by_name, by_start), "")
+    if unread:
         raise stored.error(unread)
     if is_cut(data, data):
         raise stored.error(f"the {file_kind(data)} image is cut off after {len(data)} bytes; {_REMOVE_IT}")
@@ -405,14 +411,6 @@ def _not_an_image(stored: StoredImage) -> RecordingError:
     form = f", their format is {stored.form[:80]!r}" if stored.form else ""
     known = "an image (JPEG, PNG, TIFF, BMP, PNM)"
     return stored.error(f"{len(stored.data)} bytes that cannot be read as {known}{form}; {_REMOVE_IT}")
-
-
-def _unread(data: bytes, form: str) -> str:
-    """Name and advice if the bytes are of a known unsupported format; else empty."""
-    if file_kind(data) != "other":
-        return ""
-    said = next((what for word, what in _UNREAD_FORMS.items() if word in form.lower()), "")
-    return said or next((what for start, what in _UNREAD_STARTS if start.match(data)), "")
 
 
 def _check_size(stored: StoredImage, width_px: int, height_px: int) -> None:

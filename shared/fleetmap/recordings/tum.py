@@ -6,7 +6,6 @@ Stamps are written with nine decimals and read as decimals, never through a floa
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,16 +36,15 @@ def parse_tum(text: str, what: str = "trajectory", first_line: int = 1) -> Traje
     of unit length within 1 %, or stamps that do not rise.
     """
     stamps, frame_from_body = [], []
-    for line in stamped_lines(text, what, first_line):
-        values = line.values
+    for where, line, stamp_ns, values in stamped_lines(text, what, first_line):
         if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 0.01:
             fault = "is not 't x y z qx qy qz qw' with a unit quaternion"
             if len(values) == 11:
                 fault = "has KITTI's twelve numbers of a matrix and no stamp: write 't x y z qx qy qz qw'"
             elif not np.isfinite(values).all():
                 fault = "holds NaN or infinity: leave out lines without a pose"
-            raise RecordingError(f"{line.where}: {line.text!r} {fault}")
-        stamps.append(line.stamp_ns)
+            raise RecordingError(f"{where}: {line!r} {fault}")
+        stamps.append(stamp_ns)
         frame_from_body.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
     return Trajectory(np.array(stamps, np.int64), np.array(frame_from_body).reshape(-1, 4, 4))
 
@@ -82,17 +80,11 @@ def read_truth(path: Path, log: ReadLog) -> Trajectory:
     return Trajectory(stamps_ns[kept], np.concatenate([one.frame_from_body for one in read])[kept])
 
 
-class StampedLine(NamedTuple):
-    """A line of numbers: its location, its first 80 characters, its stamp and the values after it."""
+def stamped_lines(text: str, what: str, first_line: int = 1) -> Iterator[tuple[str, str, int, Array]]:
+    """The lines of a table with rising stamps: each one's place, its first 80 characters, its stamp in ns and the values after it.
 
-    where: str
-    text: str
-    stamp_ns: int
-    values: Array
-
-
-def stamped_lines(text: str, what: str, first_line: int = 1) -> Iterator[StampedLine]:
-    """The lines of a table with rising stamps, comments and empty lines skipped; RecordingError for other lines."""
+    Comments and empty lines are skipped; RecordingError for other lines.
+    """
     last_ns: int | None = None
     is_first = True
     for number, line in enumerate(text.splitlines(), start=first_line):
@@ -110,7 +102,7 @@ def stamped_lines(text: str, what: str, first_line: int = 1) -> Iterator[Stamped
             stamp_ns = parse_stamp_ns(fields[0])
         except ValueError as error:
             raise RecordingError(f"{where}: {error}; write seconds") from error
-        yield StampedLine(where, line[:80], stamp_ns, np.array(fields[1:], np.float64))
+        yield where, line[:80], stamp_ns, np.array(fields[1:], np.float64)
         if last_ns is not None and stamp_ns <= last_ns:
             advice = "sort the lines by time"
             if stamp_ns == last_ns:

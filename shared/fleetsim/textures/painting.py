@@ -22,7 +22,9 @@ _ROWS = {
 }  # fmt: skip
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _GLYPHS = {  # (8, 6) dots, with the gap to the next
-    character: np.pad(np.array([[int(digit, 32) >> shift & 1 for shift in (4, 3, 2, 1, 0)] for digit in digits]), (0, 1))
+    character: np.pad(
+        np.array([[int(digit, 32) >> shift & 1 for shift in (4, 3, 2, 1, 0)] for digit in digits]), (0, 1)
+    )
     for character, digits in _ROWS.items()
 }
 

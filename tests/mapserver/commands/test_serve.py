@@ -15,7 +15,6 @@ import typer
 from typer.testing import CliRunner
 
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.cli_options import Program
 from fleetmap.errors import StoreError, UnreachableError, UsageError
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
@@ -92,7 +91,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
-    context = typer.Context(typer.main.get_command(cli.app), obj=Program({}, lambda _: (MapserverConfig(), {})))
+    context = typer.Context(typer.main.get_command(cli.app), obj=lambda _: (MapserverConfig(), {}))
 
     def serve_at(http: str, zenoh: str, **more: object) -> None:
         options = asdict(HttpOptions(http=http)) | more

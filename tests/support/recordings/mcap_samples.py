@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from fleetmap.geometry import se3, se3_exp
 from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.ros2 import messages as ros_messages
-from fleetmap.recordings.ros2.definitions import ros2msg
+from fleetmap.recordings.ros2.cdr import ros2msg
 from fleetmap.sensors.samples import ImuSamples
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, HEIGHT, WIDTH, calibration, make_sample
 

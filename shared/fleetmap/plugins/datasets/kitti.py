@@ -15,7 +15,7 @@ from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import lines_of, natural_key
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, paired
-from fleetmap.recordings.images import decode_grey
+from fleetmap.recordings.images import check_image
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera, intrinsics_of
 from fleetmap.sensors.cameras import lens_of
@@ -47,7 +47,9 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
         files = [folder / "calib_cam_to_cam.txt" for folder in (path, path.resolve().parent)]
         file = next((each for each in files if each.is_file()), files[0])
         calibration = RigCalibration(
-            tuple(_raw_camera(file, name[-2:], _size_px(series)) for name, series in zip(present, cameras, strict=True))
+            tuple(
+                _raw_camera(file, name[-2:], images.sources[0]) for name, images in zip(present, cameras, strict=True)
+            )
         )
         log.files.append(file)
     return finalize(RecordingParts(path, "kitti-raw", *layout.rig_frames(path, log, cameras, calibration)), log)
@@ -65,15 +67,9 @@ def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
     return np.array(stamps, np.int64)
 
 
-def _size_px(images: ImageSeries) -> tuple[int, int]:
-    """Width and height of the first image."""
-    height, width = decode_grey(layout.read_image(images.sources[0])).shape
-    return width, height
-
-
-def _raw_camera(file: Path, number: str, size_px: tuple[int, int]) -> CameraCalibration:
-    """A camera, by the size of its images: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
-    rows = _rows(file)
+def _raw_camera(file: Path, number: str, image: Path) -> CameraCalibration:
+    """A camera, by the size of an image: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
+    rows, size_px = _rows(file), check_image(layout.read_image(image))
     if np.array_equal(_numbers(file, rows, f"S_rect_{number}", 2), size_px):
         return _projected(file, rows, f"P_rect_{number}", size_px)
     matrix, turn = (_numbers(file, rows, f"{name}_{number}", 9).reshape(3, 3) for name in "KR")
@@ -120,7 +116,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         stamps_of_number = np.round(seconds * 1e9).astype(np.int64)
     left, right = (_images(path / name, stamps_of_number, log) for name in (left_name, right_name))
     if (calibration := calibration_of_options(options, log)) is None:
-        file, size_px = path / "calib.txt", _size_px(left)
+        file, size_px = path / "calib.txt", check_image(layout.read_image(left.sources[0]))
         names = (f"P{row}" for row in (left_row, right_row))
         calibration = RigCalibration(tuple(_projected(file, _rows(file), name, size_px) for name in names))
         log.files.append(file)

@@ -21,7 +21,7 @@ from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording
 from fleetmap.recordings.ros2 import messages
-from fleetmap.recordings.ros2.definitions import ros2msg
+from fleetmap.recordings.ros2.cdr import ros2msg
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
 from fleetmap.sensors.source_settings import Topics
@@ -96,8 +96,9 @@ class McapRecordingWriter:
 
     def write_imu(self, samples: ImuSamples) -> None:
         for stamp_ns, *values in zip(samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True):
-            data = messages.encode_imu(stamp_ns, BODY_FRAME, *values)
-            self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
+            self._write(
+                self._topics.imu, "sensor_msgs/Imu", stamp_ns, messages.encode_imu(stamp_ns, BODY_FRAME, *values)
+            )
 
     def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
         for sample in [samples] if isinstance(samples, WheelSample) else samples:
