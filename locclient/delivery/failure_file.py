@@ -23,7 +23,7 @@ from fleetmap.messages import FailureReport
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from fleetmap.recordings.images import StoredFrame, StoredImage, jpeg_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import FrameFeatures
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image

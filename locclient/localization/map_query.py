@@ -11,8 +11,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, interpolate_se3, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, FrameFeatures, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate

@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.messages import Cause
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.mono.mono_modes import make_odometry
-from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import FrameFeatures
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState

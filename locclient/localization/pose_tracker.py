@@ -10,9 +10,8 @@ from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes
-from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, FrameFeatures, is_reliable
 from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint

@@ -13,7 +13,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.recordings.images import jpeg_image
-from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
+from fleetmap.relocalization.map_view import cones_of_tiles, match_visible, visible_landmarks
 from fleetmap.sensors.rectification import MountedRig, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.localization.settings import LocalizerSettings

@@ -15,7 +15,7 @@ import numpy as np
 from fleetmap.failure_definition import known_radius_m
 from fleetmap.failure_summary import Moment
 from fleetmap.messages import FailureKind
-from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import FrameFeatures
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle

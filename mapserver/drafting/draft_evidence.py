@@ -21,10 +21,8 @@ from fleetmap.mapformat.manifest import Manifest, RecordingEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import decode_tile, encode_tile
 from fleetmap.recordings import Recording
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.landmark_visibility import places_around
-from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix, is_reliable
+from fleetmap.relocalization.map_view import MapView, places_around
+from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, is_reliable
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory

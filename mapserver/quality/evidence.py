@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import ERROR_LIMIT_M, is_wrong
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
-from fleetmap.relocalization.landmark_visibility import places_around
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import MapView, places_around
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, ProbeFigures, TrajectoryBreaks

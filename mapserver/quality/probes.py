@@ -13,10 +13,8 @@ from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.relocalization.alias_search import AliasCandidate
-from fleetmap.relocalization.frame_features import FrameFeatures, with_depth
-from fleetmap.relocalization.landmark_visibility import places_around
-from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView, most_similar
-from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, Relocalizer, is_reliable
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView, most_similar, places_around
+from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, FrameFeatures, Relocalizer, is_reliable, with_depth
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import T, TimeSliced, finished

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, transform_points
-from fleetmap.relocalization.landmark_visibility import ViewingCones
+from fleetmap.relocalization.map_view import ViewingCones
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Stamps, Trajectory
 from mapserver.survey.rig import scaled_bodies

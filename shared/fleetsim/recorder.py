@@ -17,9 +17,9 @@ from fleetmap.recordings.images import StoredFrame, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.motion import CarriedMotion, Motion, RouteMotion, check_clear
-from fleetsim.render.renderer import RigRenderer
+from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
+from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES

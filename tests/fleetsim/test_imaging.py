@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.imaging import pipelines as stages
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
+from fleetsim import pipelines as stages
+from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
 
 RNG = np.random.default_rng(0)
 REAL_PIPELINES = [name for name in IMAGE_PIPELINES if name != "clean"]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetsim.motion import Route, RouteMotion
-from fleetsim.render.optics import make_optics
-from fleetsim.render.renderer import Painter, RigRenderer
+from fleetsim.renderer import Painter, RigRenderer, make_optics
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import Exposure
 from fleetsim.scene.world import World

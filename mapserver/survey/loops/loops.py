@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, transform_points
-from fleetmap.relocalization.landmark_visibility import image_cells
+from fleetmap.relocalization.map_view import image_cells
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits

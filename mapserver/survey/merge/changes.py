@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array, Rings, inside_any, se3_inverse
-from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, Rows, image_cells
+from fleetmap.relocalization.map_view import COLUMNS, ROWS, Rows, image_cells
 from mapserver.survey.finish.map_assembly import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sightings

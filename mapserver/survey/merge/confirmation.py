@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, match_visible
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import MapView, Rows, VisibleLandmarks, match_visible
+from fleetmap.relocalization.relocalizer import FrameFeatures
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 

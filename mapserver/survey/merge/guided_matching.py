@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align import Patches, halvings, refine_matches
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.landmark_visibility import Rows
-from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.map_view import Rows
+from fleetmap.relocalization.relocalizer import FrameFeatures, Relocalizer
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.settings import SurveySettings

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.relocalization.landmark_visibility import Rows
+from fleetmap.relocalization.map_view import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.problem import (

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.pnp.pnp import GATE_SQUARED
-from fleetmap.relocalization.landmark_visibility import Rows, visible_landmarks
+from fleetmap.relocalization.map_view import Rows, visible_landmarks
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
 from mapserver.survey.merge.guided_matching import Sightings, keyframe_features

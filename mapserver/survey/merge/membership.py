@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import is_wrong
 from fleetmap.geometry import Array
-from fleetmap.relocalization.landmark_visibility import places_around
+from fleetmap.relocalization.map_view import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array, se3_inverse
-from fleetmap.relocalization.landmark_visibility import Rows
+from fleetmap.relocalization.map_view import Rows
 from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_sigmas_m
 from mapserver.survey.merge.base_map import BaseMap, with_baseline
 from mapserver.survey.merge.landmark_persistence import LandmarkCounts, missed_since

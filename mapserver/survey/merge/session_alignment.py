@@ -7,8 +7,7 @@ import numpy as np
 import scipy
 
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse, turn_both
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer
+from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, Relocalizer
 from fleetmap.time_sliced import finished
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph

@@ -18,9 +18,8 @@ from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.pnp.pnp import Correspondences, PnpResult, ransac_pnp, refine_pnp
-from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
-from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.relocalizer import FrameFeatures, Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, OtherView, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, wheel_between

@@ -27,7 +27,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.motion import check_clear
 from fleetsim.recorder import Order, prepare
-from fleetsim.render.renderer import RigRenderer
+from fleetsim.renderer import RigRenderer
 from mapserver.quality.probes import Probe, probe_features, relocalized
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive

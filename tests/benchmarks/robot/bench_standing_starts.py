@@ -21,7 +21,7 @@ from fleetmap.messages import Status
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, wheel_between
 from fleetmap.sources.sensor_bundle import SensorBundle
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
+from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetsim.motion import GRAVITY_MPS2
 from fleetsim.recorder import Session
-from fleetsim.render.renderer import RigRenderer
+from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_times
 

@@ -14,7 +14,7 @@ from fleetmap.features.settings import AlignSettings, StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
+from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
 
 CAMERA = StereoCamera(300.0, 239.5, 179.5, 0.12, 480, 360)
 RNG = np.random.default_rng(11)

@@ -7,9 +7,8 @@ import pytest
 
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array, se3
-from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, FrameFeatures, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.time_sliced import finished

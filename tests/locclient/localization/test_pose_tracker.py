@@ -8,8 +8,7 @@ import pytest
 from fleetmap.features import orb
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.relocalization.relocalizer import Fix, FrameFeatures
 from fleetmap.sensors.rectification import MountedCamera, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.held_maps import HeldMaps

@@ -11,9 +11,8 @@ from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.mapformat.tile import Tile
-from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.relocalizer import FrameFeatures, Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization

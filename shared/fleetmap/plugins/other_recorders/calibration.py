@@ -24,11 +24,6 @@ _UPRIGHT = 0.9  # the cosine of 26 degrees
 _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
-def rectified(info: CameraInfo) -> CameraInfo:
-    """The CameraInfo of the rectified images of a camera."""
-    return replace(info, matrix=info.projection[:, :3], lens="", distortion=np.zeros(0), rect_from_cam=np.eye(3))
-
-
 def same_lens(one: CameraInfo, other: CameraInfo) -> bool:
     """True if both describe one lens at one setting, to the rounding of drivers."""
     sizes, others = ((i.width_px, i.height_px, i.lens, len(i.distortion), i.binning, i.roi) for i in (one, other))

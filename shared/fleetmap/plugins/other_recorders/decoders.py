@@ -16,7 +16,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.mcap.container import Channel, Container
+from fleetmap.recordings.mcap.streams import Channel, Container
 from fleetmap.recordings.ros2 import messages as ros
 from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.sensors.samples import Stamps

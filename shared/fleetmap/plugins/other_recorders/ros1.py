@@ -18,7 +18,7 @@ from fleetmap.plugins.other_recorders.topics import KNOWN_TYPES, note_videos
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES
-from fleetmap.recordings.mcap.container import Channel, Message, Place
+from fleetmap.recordings.mcap.streams import Channel, Message, Place
 
 _MAGIC = b"#ROSBAG V"
 _ADVICE = {"not indexed": "rosbag reindex", "encryption": "rosbag decrypt", "Compression": "rosbag decompress"}

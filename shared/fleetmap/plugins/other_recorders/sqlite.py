@@ -17,7 +17,7 @@ from fleetmap.plugins.other_recorders.streams import open_messages
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack_message
-from fleetmap.recordings.mcap.container import Channel, Message, Place
+from fleetmap.recordings.mcap.streams import Channel, Message, Place
 
 _MAGIC = b"SQLite format 3\0"
 _PACKED = ".db3.zstd"

@@ -19,7 +19,6 @@ from fleetmap.plugins.other_recorders.calibration import (
     frames_not_optical,
     info_of_images,
     last_links,
-    rectified,
     same_lens,
     setting_of,
 )
@@ -34,9 +33,12 @@ from fleetmap.plugins.other_recorders.topics import (
     note_videos,
 )
 from fleetmap.recordings.calibration_files import CalibrationFile
-from fleetmap.recordings.mcap.container import UNDECODABLE, Channel, Container, Place
 from fleetmap.recordings.mcap.streams import (
+    UNDECODABLE,
+    Channel,
+    Container,
     ImageStream,
+    Place,
     Roles,
     Stream,
     assemble,
@@ -229,7 +231,10 @@ def _calibration(
         if info.binning != (1, 1) or info.roi[:2] != (0, 0):
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
-        cameras.append(rectified(info) if _RECTIFIED.search(image_topic.lower()) else info)
+        if _RECTIFIED.search(image_topic.lower()):
+            turned = replace(info, matrix=info.projection[:, :3], rect_from_cam=np.eye(3))
+            info = replace(turned, lens="", distortion=np.zeros(0))
+        cameras.append(info)
     said = [value for stream in roles.get("tf_static", ()) for value in stream.values]
     said.sort(key=lambda value: value[0])
     links, changes = last_links([link for _, found in said for link in found])

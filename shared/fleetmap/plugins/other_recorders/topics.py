@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from fleetmap.errors import RecordingError
 from fleetmap.plugins.other_recorders.decoders import IMU_TYPES
-from fleetmap.recordings.mcap.container import Channel, Container
+from fleetmap.recordings.mcap.streams import Channel, Container
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.source_settings import CAMERA_ROLES, IMAGE_ROLES, PACKED, Topics, transports
 

@@ -24,8 +24,7 @@ from mcap.opcode import Opcode
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack, unpack_message
-from fleetmap.recordings.mcap.container import Channel, Container, Message, Place
-from fleetmap.recordings.mcap.streams import open_written
+from fleetmap.recordings.mcap.streams import Channel, Container, Message, Place, open_written
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue

@@ -17,7 +17,7 @@ from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.recordings import images
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import INVERSE_DEPTH, StoredFrame, StoredImage
-from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT
+from fleetmap.recordings.mcap.streams import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording
 from fleetmap.recordings.ros2 import messages

@@ -11,8 +11,7 @@ import pytest
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer
+from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame

@@ -1,1 +1,0 @@
-"""Rendering: a picture and its depth from a scene and the motion of a camera."""
