@@ -9,15 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap import (
-    RECORDING_FORMATS,
-    FleetmapError,
-    OpenOptions,
-    Recording,
-    RecordingFormat,
-    open_recording,
-    read_calibration,
-)
+import fleetmap
 from fleetmap.recordings.finalize import RecordingParts, finalize
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import StoredImage
@@ -38,10 +30,10 @@ class FileReader(ImageReader):
         return self
 
 
-def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
+def open_numbered_pairs(path: Path, options: fleetmap.OpenOptions) -> fleetmap.Recording:
     """Open a folder of numbered pairs."""
     log = ReadLog()
-    calibration = read_calibration(options.calibration_file or path / "calibration.yaml")
+    calibration = fleetmap.read_calibration(options.calibration_file or path / "calibration.yaml")
     lefts, rights = (sorted(path.glob(f"*_{side}.png")) for side in ("left", "right"))
     left, right = (
         ImageSeries(np.array([int(file.name[:3]) for file in files], np.int64) * PERIOD_NS, tuple(files))
@@ -51,7 +43,7 @@ def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
     return finalize(RecordingParts(path, "numbered-pairs", calibration, frames), log)  # checks the first image, too
 
 
-RECORDING_FORMATS["numbered-pairs"] = RecordingFormat(
+fleetmap.RECORDING_FORMATS["numbered-pairs"] = fleetmap.RecordingFormat(
     "a folder of NNN_left.png and NNN_right.png with calibration.yaml",
     lambda path: path.is_dir() and any(path.glob("*_left.png")),
     open_numbered_pairs,
@@ -59,8 +51,8 @@ RECORDING_FORMATS["numbered-pairs"] = RecordingFormat(
 
 if __name__ == "__main__":
     try:
-        with open_recording(sys.argv[1]) as recording:
+        with fleetmap.open_recording(sys.argv[1]) as recording:
             found = f"{len(recording)} frames of {recording.sensor_set}, {recording.content_hash()[:12]}"
             print(f"{recording.format}: {found}")
-    except FleetmapError as error:  # its text names the next step
+    except fleetmap.FleetmapError as error:  # its text names the next step
         sys.exit(f"error: {error}")

@@ -22,31 +22,10 @@ from mapserver.commands.trust import TRUST
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
 
-_COMMANDS: Commands = {
-    "build": build,
-    "versions": versions,
-    "inspect": inspect,
-    "diff": diff,
-    "serve": serve,
-    "verify": verify,
-    "gc": gc,
-    "attach": attach,
-    "retention": retention,
-    "export": export,
-    "import": import_,
-    "convert": convert,
-    "doctor": doctor,
-    "align": align,
-    "areas": AREAS,
-    "building": BUILDING,
-    "fleet": FLEET,
-    "incidents": INCIDENTS,
-    "robots": ROBOTS,
-    "operators": OPERATORS,
-    "audit": audit,
-    "trust": TRUST,
-    **plugins("mapserver.commands"),
-}
+_FIRST = (build, versions, inspect, diff, serve, verify, gc, attach, retention, export, import_, convert, doctor, align)
+_GROUPS = {"areas": AREAS, "building": BUILDING, "fleet": FLEET, "incidents": INCIDENTS, "robots": ROBOTS}
+_LAST = {"operators": OPERATORS, "audit": audit, "trust": TRUST, **plugins("mapserver.commands")}
+_COMMANDS: Commands = {**{command.__name__.rstrip("_"): command for command in _FIRST}, **_GROUPS, **_LAST}
 COMMANDS = with_operations(_COMMANDS)
 
 

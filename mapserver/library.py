@@ -1,11 +1,4 @@
-"""The library: maps built from recordings, and maps of a store as arrays.
-
-    draft = build_map(["drive.mcap"], "maps", "hall")
-    draft.publish()
-    print(open_map("maps", "hall").points_map.shape)
-
-Paths are str or Path everywhere. Errors are FleetmapErrors.
-"""
+"""The library: maps built from recordings, and maps of a store as arrays. Paths are str or Path, errors FleetmapErrors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

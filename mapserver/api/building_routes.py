@@ -19,28 +19,22 @@ from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.store import MapStore
 
-_MOST_ALIGNMENTS = 2  # at once: each may hold a picture of many MB
+_ALIGNMENTS = asyncio.Semaphore(2)  # at once: each may hold a picture of many MB
 
 
 async def _body(request: Request) -> bytes:
     return await request.body()
 
 
-class _FewAtOnce:
-    """The body of a request that costs memory and CPU: 429 while as many others go on."""
-
-    def __init__(self, most: int) -> None:
-        self._free = asyncio.Semaphore(most)
-
-    async def __call__(self, request: Request) -> AsyncIterator[bytes]:
-        if self._free.locked():
-            raise HTTPException(429, "other alignments go on; try again when one has ended", {"Retry-After": "5"})
-        async with self._free:
-            yield await request.body()
+async def _picture(request: Request) -> AsyncIterator[bytes]:
+    if _ALIGNMENTS.locked():
+        raise HTTPException(429, "other alignments go on; try again when one has ended", {"Retry-After": "5"})
+    async with _ALIGNMENTS:
+        yield await request.body()
 
 
 File = Annotated[bytes, Depends(_body)]
-PlanFile = Annotated[bytes, Depends(_FewAtOnce(_MOST_ALIGNMENTS))]
+PlanFile = Annotated[bytes, Depends(_picture)]
 _WHAT = "the ETag of the areas that are changed: 412 if somebody changed them since"
 IfMatch = Annotated[str | None, Header(pattern=r'^(\*|(W/)?"[0-9a-f]{64}")$', description=_WHAT, examples=["*"])]
 _PIN = "NAME=PX,PY:X,Y: pixels right and down in the plan, and metres in `map`; at least two"

@@ -9,29 +9,19 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from fleetmap.errors import (
-    ChangedError,
-    FleetmapError,
-    ForbiddenError,
-    GateRefusedError,
-    InvalidValueError,
-    MapFormatError,
-    StateError,
-    StoreError,
-    UsageError,
-)
+from fleetmap import errors
 
 _log = logging.getLogger(__name__)
 
-_STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
-    (ChangedError, HTTPStatus.PRECONDITION_FAILED),
-    (StateError, HTTPStatus.CONFLICT),
-    (ForbiddenError, HTTPStatus.FORBIDDEN),
-    (InvalidValueError, HTTPStatus.UNPROCESSABLE_ENTITY),
-    (UsageError, HTTPStatus.NOT_FOUND),  # the path names an unknown site or version
-    (GateRefusedError, HTTPStatus.CONFLICT),
-    (StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
-    (MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # damaged bytes in the server's own store
+_STATUS: tuple[tuple[type[errors.FleetmapError], HTTPStatus], ...] = (
+    (errors.ChangedError, HTTPStatus.PRECONDITION_FAILED),
+    (errors.StateError, HTTPStatus.CONFLICT),
+    (errors.ForbiddenError, HTTPStatus.FORBIDDEN),
+    (errors.InvalidValueError, HTTPStatus.UNPROCESSABLE_ENTITY),
+    (errors.UsageError, HTTPStatus.NOT_FOUND),  # the path names an unknown site or version
+    (errors.GateRefusedError, HTTPStatus.CONFLICT),
+    (errors.StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
+    (errors.MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # damaged bytes in the server's own store
 )
 
 
@@ -52,7 +42,7 @@ def problem(status: int, detail: str, path: str, headers: dict[str, str] | None 
 
 def install(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
-    for kind in (FleetmapError, HTTPException, RequestValidationError, Exception):
+    for kind in (errors.FleetmapError, HTTPException, RequestValidationError, Exception):
         app.add_exception_handler(kind, _answer)
 
 
@@ -64,7 +54,7 @@ def _answer(request: Request, error: Exception) -> Response:
     if isinstance(error, RequestValidationError):
         faults = (f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}" for fault in error.errors())
         return problem(HTTPStatus.UNPROCESSABLE_ENTITY, "; ".join(faults), path)
-    if isinstance(error, FleetmapError):
+    if isinstance(error, errors.FleetmapError):
         status = next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
         if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
             _log.error("%s %r: %s", request.method, path, error)

@@ -11,13 +11,7 @@ from mapserver.fleet_statistics.canary_decision import CanaryFinding, number_of
 from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.quality.figures import TrustedCalibration
-from mapserver.store import (
-    CanaryRow,
-    FailureRow,
-    PictureRow,
-    VerdictRow,
-    VersionInfo,
-)
+from mapserver.store import CanaryRow, FailureRow, PictureRow, VerdictRow, VersionInfo
 
 T = TypeVar("T")
 

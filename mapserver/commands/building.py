@@ -9,15 +9,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import (
-    ActorOptions,
-    Json,
-    SiteOptions,
-    StoreFolder,
-    check_output,
-    open_store,
-    print_result,
-)
+from mapserver.commands import options
 
 if TYPE_CHECKING:
     from fleetmap.geometry import Array
@@ -33,7 +25,7 @@ _FORM, _RMF_FORM = "SITE=LEVEL@HEIGHT", "SITE=LEVEL"
 @expand_options
 def align(
     *,
-    where: SiteOptions,
+    where: options.SiteOptions,
     plan: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
     ] = None,
@@ -49,8 +41,8 @@ def align(
         str | None,
         typer.Option(metavar="NAME", help="Name of the level for Open-RMF; default: the building's, else L1."),
     ] = None,
-    json: Json = False,
-    by: ActorOptions,
+    json: options.Json = False,
+    by: options.ActorOptions,
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
     """Estimate the pose of the map in the building's drawing, and store it; robots get it with the signed list."""
@@ -61,7 +53,7 @@ def align(
     named = plan is not None or bool(pin)
     if show + forget + named != 1:
         raise UsageError("name --pin (and --plan) to align, --show to print the stored alignment, or --forget")
-    with open_store(where.store, read_only=show) as maps:
+    with options.open_store(where.store, read_only=show) as maps:
         corners = building.current_corners_m(maps, where.site)
         if forget:
             building.forget_alignment(maps, where.site, by.named())
@@ -81,7 +73,7 @@ def align(
         level = levels.get(where.site, "L1")
     if alignment is None:
         raise UsageError(f"site {where.site} is not aligned; `mapserver align --plan FILE --pin ...` does it")
-    print_result(alignment, _alignment_words(alignment, corners, level), json=json)
+    options.print_result(alignment, _alignment_words(alignment, corners, level), json=json)
 
 
 def _alignment_words(found: "Alignment", corners: "Array", level: str) -> Iterator[str]:
@@ -100,8 +92,8 @@ def _alignment_words(found: "Alignment", corners: "Array", level: str) -> Iterat
 @expand_options
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON of polygons, in metres.")],
-    where: SiteOptions,
-    by: ActorOptions,
+    where: options.SiteOptions,
+    by: options.ActorOptions,
 ) -> None:
     """Replace the areas of the site by those of FILE; reports, pages and metrics then use them."""
     from mapserver.fleet.building import keep_areas
@@ -111,35 +103,35 @@ def import_(
         data = opened.read(MAX_AREAS_BYTES + 1)
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
-    with open_store(where.store) as maps:
+    with options.open_store(where.store) as maps:
         names = keep_areas(maps, where.site, data, f"areas of {file.name}", by.named()).names
     typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
 
 
 @expand_options
-def remove_areas(where: SiteOptions, by: ActorOptions) -> None:
+def remove_areas(where: options.SiteOptions, by: options.ActorOptions) -> None:
     """Delete the areas of a site; their past counts stay."""
     from mapserver.fleet.building import keep_areas
 
-    with open_store(where.store) as maps:
+    with options.open_store(where.store) as maps:
         keep_areas(maps, where.site, None, "no areas", by.named())
     typer.echo(f"site {where.site} has no areas")
 
 
 @expand_options
-def list_areas(where: SiteOptions, json: Json = False) -> None:
+def list_areas(where: options.SiteOptions, json: options.Json = False) -> None:
     """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
-    with open_store(where.store, read_only=True) as maps:
+    with options.open_store(where.store, read_only=True) as maps:
         maps.current(where.site)  # raises for an unknown site
         areas = maps.areas(where.site)
     ordered = sorted(areas.areas, key=lambda area: area.name)
     lines = [f"{area.name}: {area.size_m2:.1f} m2{area.effects}" for area in ordered]
-    print_result(areas.geojson(where.site), [*lines, f"{len(lines)} areas"], json=json)
+    options.print_result(areas.geojson(where.site), [*lines, f"{len(lines)} areas"], json=json)
 
 
 @expand_options
 def export(
-    where: SiteOptions,
+    where: options.SiteOptions,
     keep_out: Annotated[
         Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's KeepoutFilter, and its image.")
     ] = None,
@@ -156,8 +148,8 @@ def export(
     if not any(asked.values()):
         raise UsageError("name a file by --keep-out or --speed")
     for kind, file in asked.items():
-        check_output(f"--{kind.value}", file, ".yaml")
-    with open_store(where.store, read_only=True) as maps:
+        options.check_output(f"--{kind.value}", file, ".yaml")
+    with options.open_store(where.store, read_only=True) as maps:
         maps.current(where.site)
         areas = maps.areas(where.site)
     grids = {file: mask_grid(areas, kind) for kind, file in asked.items() if file is not None}
@@ -181,8 +173,8 @@ def set_(
         Path | None,
         typer.Option("--from", metavar="FILE", help="Take heights and lifts from a *.building.yaml of Open-RMF."),
     ] = None,
-    store: StoreFolder,
-    by: ActorOptions,
+    store: options.StoreFolder,
+    by: options.ActorOptions,
 ) -> None:
     """Make aligned sites the floors of a building; robots of each of them then know all of its floors."""
     from fleetmap.mapformat.building import Building
@@ -191,22 +183,22 @@ def set_(
 
     drawn_name, levels = ("", {}) if file is None else read_rmf(file)
     building = Building(name=name or drawn_name, floors=tuple(_entry(text, levels) for text in floor))
-    with open_store(store) as maps:
+    with options.open_store(store) as maps:
         keep = partial(keep_rmf_building, levels=levels) if levels else keep_building
         kept = keep(maps, building, actor=by.named())
         lifts = single_lifts(floors_of(maps, kept))
-        print_result(kept, _building_words(maps, kept))
+        options.print_result(kept, _building_words(maps, kept))
     if lifts:
         words = "areas with the same `lift` on the other floors are missing"
         typer.echo(f"note: {', '.join(lifts)}: {words}", err=True)
 
 
 @expand_options
-def remove_building(name: _Name, *, store: StoreFolder, by: ActorOptions) -> None:
+def remove_building(name: _Name, *, store: options.StoreFolder, by: options.ActorOptions) -> None:
     """Let the floors of a building be sites of their own again; their maps stay."""
     from mapserver.fleet import building
 
-    with open_store(store) as maps:
+    with options.open_store(store) as maps:
         removed = building.remove_building(maps, name, by.named())
     typer.echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
 
@@ -214,8 +206,8 @@ def remove_building(name: _Name, *, store: StoreFolder, by: ActorOptions) -> Non
 @expand_options
 def list_buildings(
     *,
-    store: StoreFolder,
-    json: Json = False,
+    store: options.StoreFolder,
+    json: options.Json = False,
     form: Annotated[
         Literal["rmf"] | None, typer.Option("--as", metavar="rmf", help="Print a *.building.yaml of Open-RMF.")
     ] = None,
@@ -224,13 +216,13 @@ def list_buildings(
     from mapserver.fleet.building import buildings, floors_of
     from mapserver.floor_plan.rmf import rmf_text
 
-    with open_store(store, read_only=True) as maps:
+    with options.open_store(store, read_only=True) as maps:
         found = buildings(maps)
         if form == "rmf" and not json:
             typer.echo("---\n".join(rmf_text(building, floors_of(maps, building)) for building in found), nl=False)
             return
         lines = [line for building in found for line in _building_words(maps, building)]
-    print_result(found, [*lines, f"buildings: {len(found)}"], json=json)
+    options.print_result(found, [*lines, f"buildings: {len(found)}"], json=json)
 
 
 def _entry(text: str, levels: "Mapping[str, RmfLevel]") -> "FloorEntry":

@@ -70,11 +70,7 @@ _FIGURES = {
 
 
 def _words(
-    info: "VersionInfo",
-    manifest: "Manifest",
-    per_m: float | None,
-    verdicts: "list[VerdictRow]",
-    history: "list[Event]",
+    info: "VersionInfo", manifest: "Manifest", per_m: float | None, verdicts: "list[VerdictRow]", history: "list[Event]"
 ) -> Iterator[str]:
     from mapserver.quality.figures import trusted_calibrations
 

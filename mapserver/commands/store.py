@@ -11,18 +11,7 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import BusyError, StoreError, UsageError
-from mapserver.commands.options import (
-    ActorOptions,
-    Json,
-    NewStoreFolder,
-    SiteName,
-    StoreFolder,
-    check_output,
-    open_store,
-    print_result,
-    shown_progress,
-    version_named,
-)
+from mapserver.commands import options
 
 if TYPE_CHECKING:
     from mapserver.store import AuditLine, MapStore
@@ -32,11 +21,11 @@ EXIT_STATUS_FAULTS = 3
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")]
 
 
-def verify(store: StoreFolder, json: Json = False) -> None:
+def verify(store: options.StoreFolder, json: options.Json = False) -> None:
     """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
-    with open_store(store, read_only=True) as maps:
+    with options.open_store(store, read_only=True) as maps:
         found = maps.verify()
-    print_result(found, _findings(store, found), json=json)
+    options.print_result(found, _findings(store, found), json=json)
     if found.faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
@@ -54,16 +43,16 @@ def _findings(store: Path, found: "StoreFindings") -> Iterator[str]:
 @expand_options
 def gc(
     *,
-    store: StoreFolder,
+    store: options.StoreFolder,
     keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5,
     keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3,
     keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0,
     robot_days: Annotated[
         float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
     ] = 30.0,
-    by: ActorOptions,
+    by: options.ActorOptions,
     dry_run: DryRun = False,
-    json: Json = False,
+    json: options.Json = False,
 ) -> None:
     """Remove drafts and retired versions beyond retention, and unreferenced files.
 
@@ -77,7 +66,7 @@ def gc(
     retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
 
     def collect() -> "Garbage":
-        with open_store(store, read_only=dry_run) as maps:
+        with options.open_store(store, read_only=dry_run) as maps:
             return maps.collect_garbage(retention, dry_run=dry_run, actor=by.named())
 
     try:
@@ -95,20 +84,20 @@ def gc(
     words = [f"site {site}: version {version} {would}retired" for site, version in garbage.retired]
     words += [f"site {site}: version {version} {would}removed" for site, version in garbage.removed]
     words.append(f"{garbage.files} files {would}removed, {garbage.freed_bytes} bytes {would}freed")
-    print_result(garbage, words, json=json)
+    options.print_result(garbage, words, json=json)
 
 
 @expand_options
 def retention(
     context: typer.Context,
     *,
-    store: StoreFolder,
+    store: options.StoreFolder,
     inbox: Annotated[
         Path | None, typer.Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
     ] = None,
     dry_run: DryRun = False,
     config: ConfigFile = None,
-    json: Json = False,
+    json: options.Json = False,
 ) -> None:
     """Remove reports, pictures and recordings that are older than their periods, as the nightly job does.
 
@@ -118,13 +107,13 @@ def retention(
     from mapserver.nightly.inbox import apply_retention, sites_of
 
     inboxes = [] if inbox is None else [inbox, *(inbox / site for site in sites_of(inbox))]
-    with open_store(store) as maps, ExitStack() as locks:
+    with options.open_store(store) as maps, ExitStack() as locks:
         free = [each for each in inboxes if not is_name(each.name) or _is_free(maps, each.name, locks)]
         removed = apply_retention(maps, settings_of(context).ingest.retention(), free, dry_run=dry_run)
     for each in sorted({*inboxes} - {*free}):
         typer.echo(f"{each}: a night reads its recordings; it removed what was old at its start", err=True)
     would = "would be " if dry_run else ""
-    print_result(removed, (f"{name}: {count} {would}removed" for name, count in removed.items()), json=json)
+    options.print_result(removed, (f"{name}: {count} {would}removed" for name, count in removed.items()), json=json)
 
 
 def _is_free(maps: "MapStore", site: str, locks: ExitStack) -> bool:
@@ -140,17 +129,17 @@ def _is_free(maps: "MapStore", site: str, locks: ExitStack) -> bool:
 
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced if it exists.")],
-    site: SiteName,
-    store: StoreFolder,
+    site: options.SiteName,
+    store: options.StoreFolder,
     version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
     without_archive: Annotated[
         bool, typer.Option("--without-archive", help="Leave out data needed only by later surveys.")
     ] = False,
 ) -> None:
     """Write a version into FILE; `mapserver import` reads it into another store."""
-    check_output("FILE", file)
-    with open_store(store, read_only=True) as maps:
-        version = version_named(maps, site, version)
+    options.check_output("FILE", file)
+    with options.open_store(store, read_only=True) as maps:
+        version = options.version_named(maps, site, version)
         size = maps.export_version(site, version, file, archive=not without_archive)
     typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
 
@@ -158,36 +147,36 @@ def export(
 @expand_options
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File written by `mapserver export`.")],
-    store: NewStoreFolder,
-    by: ActorOptions,
+    store: options.NewStoreFolder,
+    by: options.ActorOptions,
 ) -> None:
     """Import the version in FILE into a store, as a draft of its site with the same number."""
-    with open_store(store, create=True) as maps:
+    with options.open_store(store, create=True) as maps:
         info = maps.import_version(file, actor=by.named())
     typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")
 
 
 def audit(
-    store: StoreFolder,
+    store: options.StoreFolder,
     verify: Annotated[bool, typer.Option("--verify", help="Check the hash chain; status 3 for a fault.")] = False,
     last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
     person: Annotated[str | None, typer.Option(metavar="NAME", help="Only what this person did.")] = None,
     site: Annotated[str | None, typer.Option(help="Only what was done to this site.")] = None,
     kind: Annotated[str | None, typer.Option(metavar="KIND", help="Only kinds that begin so.")] = None,
-    json: Json = False,
+    json: options.Json = False,
 ) -> None:
     """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
     from mapserver.store import chain_faults
 
-    with open_store(store, read_only=True) as maps:
-        lines = maps.audit_lines() if verify else maps.log(site=site, person=person, kind=kind, limit=last)[::-1]
+    with options.open_store(store, read_only=True) as maps:
+        lines = (maps.log() if verify else maps.log(site=site, person=person, kind=kind, limit=last))[::-1]
     if not verify:
-        print_result(lines, map(_words, lines), json=json)
+        options.print_result(lines, map(_words, lines), json=json)
         return
     faults = chain_faults(lines)
     summary = f"{len(lines)} lines, {f'{len(faults)} faults' if faults else 'clean'}"
     told = [*(f"fault: {fault}" for fault in faults), summary]
-    print_result({"lines": len(lines), "faults": faults}, told, json=json)
+    options.print_result({"lines": len(lines), "faults": faults}, told, json=json)
     if faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
@@ -203,7 +192,7 @@ def _words(line: "AuditLine") -> str:
 
 
 def attach(
-    store: NewStoreFolder,
+    store: options.NewStoreFolder,
     content: Annotated[
         str | None, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")
     ] = None,
@@ -217,7 +206,7 @@ def attach(
 
     if content is None and database is None:
         raise UsageError("name --content, --database or both")
-    with shown_progress("blobs") as progress:
+    with options.shown_progress("blobs") as progress:
         copied = MapStore.attach(store, Places(content, database), progress)
     typer.echo(
         f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"

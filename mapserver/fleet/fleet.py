@@ -11,21 +11,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from fleetmap import messages
 from fleetmap.encoding import to_plain
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.files import write_atomically
 from fleetmap.mapformat.manifest import Name
-from fleetmap.messages import (
-    MAX_THUMBNAIL_BYTES,
-    FailureAck,
-    FailureReport,
-    PoseMessage,
-    RobotAck,
-    RobotHealth,
-    Status,
-    WantedVersion,
-    decode_message,
-)
 from mapserver.fleet.ingest import Ingest, IngestSettings, Stream
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.replay_intake import ReplayIntake
@@ -36,7 +26,7 @@ from mapserver.store.files import check_no_link, make_folder
 from mapserver.store.rows import RobotInfo
 
 MAX_ROBOTS = 10_000
-MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with text
+MAX_FAILURE_BYTES = 4 * messages.MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with text
 # A robot that fails more than once a minute is broken; 60 may be stored from an hour without a network.
 FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
 _FORGET_AFTER_NS = 600_000_000_000
@@ -79,7 +69,7 @@ class _Robot(msgspec.Struct):
     version: int | None = None
     seen_ns: int = 0
     report: dict[str, Any] = {}
-    last_estimate: PoseMessage | None = None
+    last_estimate: messages.PoseMessage | None = None
     skew: ClockSkew = msgspec.field(default_factory=ClockSkew)
     stream: Stream = msgspec.field(default_factory=Stream)
     is_present: bool | None = None
@@ -102,26 +92,26 @@ class _Robot(msgspec.Struct):
 class _Assignment(NamedTuple):
     """A site's current version, and its canary version."""
 
-    current: WantedVersion
+    current: messages.WantedVersion
     canary: CanaryRow | None = None
-    tried: WantedVersion | None = None
+    tried: messages.WantedVersion | None = None
 
     def is_canary(self, robot: str) -> bool:
         canary = self.canary
         return canary is not None and number_of(canary.site, canary.version, robot) < canary.threshold
 
-    def wanted(self, robot: str) -> WantedVersion:
+    def wanted(self, robot: str) -> messages.WantedVersion:
         return self.tried if self.tried is not None and self.is_canary(robot) else self.current
 
 
 def _assignment(store: MapStore, site: str) -> _Assignment:
     info, running = store.current(site), store.canaries(site, running=True)
     number, address = (None, None) if info is None else (info.version, info.manifest_sha256)
-    current = WantedVersion(site=site, version=number, manifest_sha256=address)
+    current = messages.WantedVersion(site=site, version=number, manifest_sha256=address)
     if not running:
         return _Assignment(current)
     number, address = running[0].version, store.version(site, running[0].version).manifest_sha256
-    return _Assignment(current, running[0], WantedVersion(site=site, version=number, manifest_sha256=address))
+    return _Assignment(current, running[0], messages.WantedVersion(site=site, version=number, manifest_sha256=address))
 
 
 class Fleet:
@@ -145,21 +135,21 @@ class Fleet:
         self._robots = {(info.site, info.robot): _stored(info) for info in store.robots()}
         self.storage_fault = ""
 
-    def wanted_version(self, site: str, robot: str) -> WantedVersion:
+    def wanted_version(self, site: str, robot: str) -> messages.WantedVersion:
         """Return the version that a robot should run: its site's current one, or the canary version.
 
         Raises UsageError for an unknown site.
         """
         return _assignment(self._store, site).wanted(robot)
 
-    def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
+    def wanted_versions(self, site: str) -> dict[str, messages.WantedVersion]:
         """Return the same for all robots of a site that ever sent a message or query."""
         assignment = _assignment(self._store, site)
         with self._lock:
             names = sorted(robot for of, robot in self._robots if of == site)
         return {robot: assignment.wanted(robot) for robot in names}
 
-    def take_question(self, site: str, robot: str) -> WantedVersion:
+    def take_question(self, site: str, robot: str) -> messages.WantedVersion:
         """As `wanted_version`, queried by the robot itself: it is then registered, and notified of the next version."""
         wanted = self.wanted_version(site, robot)
         with self._lock:
@@ -167,7 +157,7 @@ class Fleet:
                 self._robots.setdefault((site, robot), _Robot()).seen_ns = self._clock_ns()
         return wanted
 
-    def take_ack(self, site: str, robot: str, ack: RobotAck) -> None:
+    def take_ack(self, site: str, robot: str, ack: messages.RobotAck) -> None:
         """Store an acknowledgement; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, ack)
         with self._lock:
@@ -177,7 +167,7 @@ class Fleet:
         with self._storing():
             self._store.record_robot_report(site, robot, report, version)
 
-    def take_health(self, site: str, robot: str, health: RobotHealth) -> None:
+    def take_health(self, site: str, robot: str, health: messages.RobotHealth) -> None:
         """Count a report and buffer it until the next `flush`; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, health)
         now_ns = self._clock_ns()
@@ -201,13 +191,13 @@ class Fleet:
             last = (entry.version, now_ns, dict(entry.report))
             self._ingest.take_health(entry.stream, health, entry.last_estimate, last)
 
-    def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
+    def take_pose(self, site: str, robot: str, message: messages.PoseMessage) -> None:
         with self._lock:
             entry = self._entry(site, robot, self._clock_ns(), message.map_version)
             entry.last_estimate = message
             entry.stream.health.take_pose(message)
 
-    def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:
+    def take_failure(self, site: str, robot: str, report: messages.FailureReport) -> messages.FailureAck:
         """Store a failure, once however often it arrives; it is on the disk when this returns.
 
         A permanent refusal is in the answer; StoreError if a later attempt may succeed.
@@ -221,12 +211,12 @@ class Fleet:
             with self._lock:
                 ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
         except LinkError as error:
-            return FailureAck(id=report.id, refused=str(error)[:2000])
+            return messages.FailureAck(id=report.id, refused=str(error)[:2000])
         with self._storing():
             self._ingest.take_failure(report, now_ns, ahead_s)
-        return FailureAck(id=report.id)
+        return messages.FailureAck(id=report.id)
 
-    def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
+    def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> messages.FailureAck:
         """As `take_failure`, of an encoded report; names as of `check_name`. A permanently refused one is kept in the store's folder.
 
         Raises LinkError for bytes without a readable report id, and above the robot's rate limit: it
@@ -239,7 +229,7 @@ class Fleet:
         try:
             if len(payload) > MAX_FAILURE_BYTES:
                 raise LinkError(f"a failure report of {len(payload)} bytes; the limit is {MAX_FAILURE_BYTES}")
-            ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
+            ack = self.take_failure(site, robot, messages.decode_message(payload, messages.FailureReport))
         except LinkError as error:
             ack = rejection(payload, str(error))
         if ack.refused:
@@ -340,10 +330,12 @@ def _stored(info: RobotInfo) -> _Robot:
 
 def _state(status: object) -> object:
     """Return the state group: LOST, AMBIGUOUS and INITIALISING count as one, without a known position."""
-    return status if status in {Status.TRACKING, Status.DEGRADED, None} else Status.LOST
+    return status if status in {messages.Status.TRACKING, messages.Status.DEGRADED, None} else messages.Status.LOST
 
 
-def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:
+def _check_sender(
+    site: str, robot: str, message: messages.RobotAck | messages.RobotHealth | messages.FailureReport
+) -> None:
     if (message.site, message.robot) != (site, robot):
         raise LinkError(f"robot {robot!r} of {site!r} reports in the name of {message.robot!r} of {message.site!r}")
 
@@ -352,13 +344,13 @@ class _IdOnly(msgspec.Struct, frozen=True):
     id: Name
 
 
-def rejection(payload: bytes, reason: str) -> FailureAck:
+def rejection(payload: bytes, reason: str) -> messages.FailureAck:
     """Return the answer that stops a robot from resending an unreadable report; raises LinkError if its id is unreadable too."""
     try:
         known = msgspec.msgpack.decode(payload, type=_IdOnly)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise LinkError(reason) from error
-    return FailureAck(id=known.id, refused=reason[:2000])
+    return messages.FailureAck(id=known.id, refused=reason[:2000])
 
 
 def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes, reason: str) -> None:

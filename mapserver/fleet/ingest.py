@@ -150,8 +150,6 @@ class Ingest:
         with self._flushing:
             with self._lock:
                 batch, self._batch = self._batch, FleetBatch()
-            if not (batch.counters or batch.last_reports):
-                return
             try:
                 self._store.fleet.add(batch)
             except UnknownOutcomeError:

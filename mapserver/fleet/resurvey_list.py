@@ -8,15 +8,8 @@ from datetime import UTC, datetime
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.manifest import TileEntry
 from fleetmap.mapformat.tile_codec import decode_tile
+from mapserver.fleet_statistics import resurvey_decision as decision
 from mapserver.fleet_statistics.kpis import Counters, hour_of
-from mapserver.fleet_statistics.resurvey_decision import (
-    ResurveySettings,
-    TileConcern,
-    Waypoint,
-    concern_of,
-    concerns,
-    route,
-)
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import MapStore
 
@@ -30,19 +23,19 @@ class ResurveyList:
 
     site: str
     version: int | None
-    tiles: list[TileConcern]
-    route: list[Waypoint]
+    tiles: list[decision.TileConcern]
+    route: list[decision.Waypoint]
     requests: list[SurveyRequest]
 
 
-def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns: int) -> ResurveyList:
+def resurvey_list(store: MapStore, site: str, settings: decision.ResurveySettings, now_ns: int) -> ResurveyList:
     """Return the list as of now; raises UsageError for an unknown site."""
     current = store.current(site)
     recent_hour = hour_of(now_ns) - round(settings.recent_days * 24)
     before_hour = recent_hour - round(settings.before_days * 24)
     recent = store.fleet.counters_of(site, "tile", recent_hour)
     before = store.fleet.counters_of(site, "tile", before_hour, recent_hour)
-    found = concerns(recent, before, settings)
+    found = decision.concerns(recent, before, settings)
     requests = store.survey_requests(site)
     if current is None:
         return ResurveyList(site, None, found, [], requests)
@@ -52,7 +45,7 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     first = [
         replace(known[tile], reasons=[*words, *known[tile].reasons])
         if tile in known
-        else concern_of(tile, words, recent.get(tile, Counters()), before.get(tile, Counters()))
+        else decision.concern_of(tile, words, recent.get(tile, Counters()), before.get(tile, Counters()))
         for tile, words in asked.items()
     ]
     found = [*first, *(concern for concern in found if concern.tile not in asked)]
@@ -61,7 +54,7 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     found = [replace(concern, name=areas.name_tiles(concern.name, manifest.tile_size_m)) for concern in found]
     tiles = [concern.tile for concern in found if concern.tile in entries]
     places = {tile: _place(store, entries[tile], manifest.tile_size_m) for tile in tiles}
-    return ResurveyList(site, current.version, found, route(found, places), requests)
+    return ResurveyList(site, current.version, found, decision.route(found, places), requests)
 
 
 def _asked(requests: Sequence[SurveyRequest], size_m: float) -> dict[str, list[str]]:

@@ -2,16 +2,7 @@
 
 import math
 
-from fleetmap.failure_definition import (
-    BLIND_S,
-    CHI2_6_0999,
-    GOOD_S,
-    SearchClock,
-    is_blind,
-    is_driving,
-    is_usable,
-    is_wrong,
-)
+from fleetmap import failure_definition as definition
 from fleetmap.messages import Flag, PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import number_of
@@ -38,7 +29,7 @@ class HealthStream:
         self._silent_ms = 0
         self._watched_ns = 0  # observed time since the first fix, used to measure blindness
         self.in_failure = False  # blind, or lost for too long, and no 5 s of good tracking since
-        self._search = SearchClock()
+        self._search = definition.SearchClock()
         self._search_ns = 0  # observed time, used to measure the search
         self._place: tuple[int, float, float] | None = None
         self._pose_mps: float | None = None
@@ -61,7 +52,7 @@ class HealthStream:
         if self._stamp_ns is None or went_back or health.stamp_ns < self._stamp_ns:
             self._stamp_ns, self._figures = None, {}
             self._has_fix = self._fix_counted = self.in_failure = False
-            self._search, self._search_ns = SearchClock(), 0
+            self._search, self._search_ns = definition.SearchClock(), 0
             self._blind_since_ns = self._good_since_ns = self._jump_ns = None
         # Since the last report by the robot's wall clock, which runs while its cameras are silent; else by stamps
         dt_ms = 0 if self._stamp_ns is None else (health.stamp_ns - self._stamp_ns) // 1_000_000
@@ -70,7 +61,7 @@ class HealthStream:
         dt_ms = dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
         counts = Counters(reports=1, observed_ms=dt_ms)
         speed_mps = figures.get("speed_mps", self._pose_mps)
-        counts.driving_ms = dt_ms if speed_mps is not None and is_driving(speed_mps) else 0
+        counts.driving_ms = dt_ms if speed_mps is not None and definition.is_driving(speed_mps) else 0
         self._count_status(counts, health, figures, dt_ms, speed_mps)
         self._count_fixes(counts, health.stamp_ns, figures)
         if "frame_ms_mean" in figures:
@@ -99,29 +90,29 @@ class HealthStream:
         self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int, speed_mps: float | None
     ) -> None:
         self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
-        is_stale = self._silent_ms > BLIND_S * 1e3  # the last frame is so old that the status is outdated
+        is_stale = self._silent_ms > definition.BLIND_S * 1e3  # the last frame is so old that the status is outdated
         is_tracking = health.status == Status.TRACKING and not is_stale
         radius_m = figures.get("radius_95_m", math.inf)
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
-        counts.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
-        counts.judged_ms = dt_ms if is_driving(speed_mps) else 0
+        counts.usable_ms = dt_ms if not is_stale and definition.is_usable(health.status, radius_m) else 0
+        counts.judged_ms = dt_ms if definition.is_driving(speed_mps) else 0
         counts.found_ms = counts.judged_ms if is_tracking else 0
         self._search_ns += dt_ms * 1_000_000
         is_new = self._search.handle(
             self._search_ns,
             is_found=is_tracking,
-            is_driving=is_driving(speed_mps),
+            is_driving=definition.is_driving(speed_mps),
             may_be_mapped=Flag.OFF_MAP not in health.flags,
         )
         if self._has_fix:
             counts.after_fix_ms = dt_ms
             counts.localised_ms = dt_ms if is_tracking else 0
             self._watched_ns += dt_ms * 1_000_000
-            is_blind_now = is_stale or is_blind(health.status, radius_m)
+            is_blind_now = is_stale or definition.is_blind(health.status, radius_m)
             if dt_ms == 0:
                 self._blind_since_ns = None  # the time in between is unknown
             since_ns = self._blind_since_ns
-            is_new |= since_ns is not None and self._watched_ns - since_ns > BLIND_S * 1e9
+            is_new |= since_ns is not None and self._watched_ns - since_ns > definition.BLIND_S * 1e9
             if not is_blind_now:  # blindness lasts until the next better report
                 self._blind_since_ns = None
             elif since_ns is None:
@@ -132,7 +123,7 @@ class HealthStream:
             self._good_since_ns = None
         elif self._good_since_ns is None or dt_ms == 0:
             self._good_since_ns = self._search_ns
-        if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= GOOD_S * 1e9:
+        if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= definition.GOOD_S * 1e9:
             self.in_failure = False
 
     def _count_fixes(self, counts: Counters, stamp_ns: int, figures: dict[str, float]) -> None:
@@ -143,15 +134,15 @@ class HealthStream:
         if innovation is not None:
             counts.innovations, counts.innovation_sum = 1, innovation
             counts.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
-            counts.exceeded = int(innovation > CHI2_6_0999)
-        if self._has_fix and is_wrong(figures.get("fix_innovation_m", 0.0)):
+            counts.exceeded = int(innovation > definition.CHI2_6_0999)
+        if self._has_fix and definition.is_wrong(figures.get("fix_innovation_m", 0.0)):
             # The estimate was wrong before, or is now. Jumps within 5 s count once; a jump within a failure belongs to it.
-            is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
+            is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= definition.GOOD_S * 1e9
             counts.jumps = int(is_new and not self.in_failure)
             self._jump_ns = stamp_ns
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:
-            counts.docks, counts.docks_wrong = 1, int(is_wrong(dock_m))
+            counts.docks, counts.docks_wrong = 1, int(definition.is_wrong(dock_m))
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:

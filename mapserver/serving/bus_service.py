@@ -8,31 +8,19 @@ from typing import Any
 
 import msgspec
 
+from fleetmap import messages
 from fleetmap.bus.zenoh_bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError, StateError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat.names import check_name
-from fleetmap.messages import (
-    FailureAck,
-    InitialPoseMessage,
-    PoseMessage,
-    RobotAck,
-    RobotHealth,
-    SurveyArea,
-    decode_message,
-    encode_message,
-    part_of,
-    robot_key,
-    split_key,
-)
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_access import BusGuard
 from mapserver.store import Actor, MapStore
 from mapserver.trust import SignedLists
 
-TakeDrive = Callable[[str, str, ReplayPart], FailureAck]
+TakeDrive = Callable[[str, str, ReplayPart], messages.FailureAck]
 Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok", "refused" or "dropped", bytes sent)."""
 
@@ -41,7 +29,7 @@ MAX_REPORT_BYTES = 16 << 10  # a complete health report has 3 kB, a pose 0.5 kB
 # A robot's limit of messages, at once and per second: health once a second, poses with every frame, an ack per version.
 RENEWAL_RATE = (5, 1 / 60)  # per robot: each costs a signature and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
-REPORTS: dict[str, type[Any]] = {"ack": RobotAck, "health": RobotHealth, "pose": PoseMessage}
+REPORTS: dict[str, type[Any]] = {"ack": messages.RobotAck, "health": messages.RobotHealth, "pose": messages.PoseMessage}
 _MOST_AREAS = 20  # told to a robot, the oldest requests first
 _CACHED_BYTES = 64_000_000
 _ENTRY_BYTES = 200  # overhead of a cache entry, so that empty ones are limited too
@@ -80,7 +68,7 @@ class BusService:
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES, store.blob)
         self._handles: list[Handle] = [
-            bus.queryable(robot_key("*", "*", keys), self._counted(what, answer))
+            bus.queryable(messages.robot_key("*", "*", keys), self._counted(what, answer))
             for keys, what, answer in (
                 ("wanted", "wanted", self._wanted),
                 ("failures", "failure", self._failure),
@@ -92,7 +80,7 @@ class BusService:
             )
         ]
         for what in REPORT_RATES:
-            self.hear(robot_key("*", "*", what), what, self._take)
+            self.hear(messages.robot_key("*", "*", what), what, self._take)
 
     def announce_changes(self) -> list[str]:
         """Notify every known robot whose wanted version changed since the last call; return the sites of notified robots.
@@ -106,14 +94,14 @@ class BusService:
                 key, address = (info.site, robot), wanted.manifest_sha256
                 known.add(key)
                 if key not in self._announced or self._announced[key] != address:
-                    self._bus.publish(robot_key(info.site, robot, "wanted"), encode_message(wanted))
+                    self._bus.publish(messages.robot_key(info.site, robot, "wanted"), messages.encode_message(wanted))
                     self._announced[key] = address
                     changed.append(info.site)
         self._announced = {key: address for key, address in self._announced.items() if key in known}
         return sorted(set(changed))
 
     def look_for_robots(self) -> None:
-        keys = (split_key(key) for key in self._bus.alive(robot_key("*", "*", "alive")))
+        keys = (messages.split_key(key) for key in self._bus.alive(messages.robot_key("*", "*", "alive")))
         self._fleet.take_presence((site, robot) for site, robot, _ in keys)
 
     def close(self) -> None:
@@ -133,11 +121,11 @@ class BusService:
         return counted
 
     def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
-        return lambda key, question: part_of(whole(key), question)
+        return lambda key, question: messages.part_of(whole(key), question)
 
     def _sender(self, key: str) -> tuple[str, str]:
         """Return site and robot of a robot's key; LinkError for one without permission, even if the bus let it through."""
-        site, robot, _ = split_key(key)
+        site, robot, _ = messages.split_key(key)
         check_name(site, "site")
         check_name(robot, "robot")
         if self._guard is not None and (site, robot) not in self._guard.access.robots:
@@ -157,27 +145,29 @@ class BusService:
         wanted = self._fleet.take_question(*self._sender(key))
         answer = self._lists.admitted_or_current(wanted)
         asked = () if self._take_drive is None else self._store.survey_requests(wanted.site)[:_MOST_AREAS]
-        surveys = tuple(SurveyArea(id=r.id, corners_map_m=[(x, y) for x, y in r.corners_map_m]) for r in asked)
-        return encode_message(msgspec.structs.replace(answer, restored_ns=self._restored_ns, surveys=surveys))
+        surveys = tuple(messages.SurveyArea(id=r.id, corners_map_m=[(x, y) for x, y in r.corners_map_m]) for r in asked)
+        return messages.encode_message(msgspec.structs.replace(answer, restored_ns=self._restored_ns, surveys=surveys))
 
     def _failure(self, key: str, payload: bytes) -> bytes:
         site, robot = self._sender(key)
         ack = self._fleet.take_failure_bytes(site, robot, payload)
         if ack.refused:
             self._count("failure refused for good", "refused", 0)
-        return encode_message(ack)
+        return messages.encode_message(ack)
 
     def _replay(self, key: str, payload: bytes) -> bytes:
         site, robot = self._sender(key)
-        part = decode_message(payload, ReplayPart)
+        part = messages.decode_message(payload, ReplayPart)
         if part.survey is None:
-            return encode_message(self._fleet.replays.take(site, robot, part))
+            return messages.encode_message(self._fleet.replays.take(site, robot, part))
         if self._take_drive is None:
-            return encode_message(FailureAck(id=part.id, refused="this server has no inbox for drives"))
-        return encode_message(self._take_drive(site, robot, part))
+            return messages.encode_message(
+                messages.FailureAck(id=part.id, refused="this server has no inbox for drives")
+            )
+        return messages.encode_message(self._take_drive(site, robot, part))
 
     def _manifest(self, key: str) -> bytes:
-        site, _what, number = split_key(key)
+        site, _what, number = messages.split_key(key)
         if not number.isdecimal() or len(number) > 10:
             raise LinkError(f"invalid version number {number[:80]!r}")
         info = self._store.version(site, int(number))
@@ -186,11 +176,11 @@ class BusService:
         return self._recent.get(info.manifest_sha256)
 
     def _list_file(self, key: str) -> bytes:
-        site, _what, name = split_key(key)
+        site, _what, name = messages.split_key(key)
         return self._lists.file(check_name(site, "site"), name)
 
     def _blob(self, key: str) -> bytes:
-        site, _what, sha256 = split_key(key)
+        site, _what, sha256 = messages.split_key(key)
         if self._store.served_kind(sha256, site) is None:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
         return self._recent.get(sha256)
@@ -203,7 +193,7 @@ class BusService:
             return "dropped"
         if len(payload) > MAX_REPORT_BYTES:
             raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
-        getattr(self._fleet, f"take_{what}")(site, robot, decode_message(payload, REPORTS[what]))
+        getattr(self._fleet, f"take_{what}")(site, robot, messages.decode_message(payload, REPORTS[what]))
         return None
 
     def hear(self, keys: str, what: str, take: Callable[[str, bytes], str | None]) -> None:
@@ -223,7 +213,9 @@ class BusService:
         self._handles.append(self._bus.subscribe(keys, heard))
 
 
-def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPoseMessage, actor: Actor) -> None:
+def place_robot(
+    store: MapStore, fleet: Fleet, bus: Bus | None, told: messages.InitialPoseMessage, actor: Actor
+) -> None:
     """Publish the pose for its robot, and log its author in the site's history. bus: None if the server has none.
 
     UsageError for an unknown site or robot and a position outside the map, StateError for a robot that is not connected.
@@ -247,7 +239,7 @@ def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPos
         raise UsageError(f"{where} is outside of version {version}: it has no tile {x},{y}")
     heading = "" if told.heading_rad is None else f", heading {math.degrees(told.heading_rad):.0f} degrees"
     words = f"{told.robot} is at {told.x_map_m:.2f}, {told.y_map_m:.2f} m{heading}, within {told.sigma_m:g} m"
-    bus.publish(robot_key(told.site, told.robot, "initial_pose"), encode_message(told))
+    bus.publish(messages.robot_key(told.site, told.robot, "initial_pose"), messages.encode_message(told))
     store.audit("robot placed", words, actor=actor, site=told.site)
 
 

@@ -12,17 +12,8 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import FailureReport, decode_message
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
 from mapserver.floor_plan.areas import Areas
+from mapserver.store import rows as records
 from mapserver.store.database import Database, Transaction, matching
-from mapserver.store.rows import (
-    AXES,
-    FailureDetail,
-    FailureFilter,
-    FailureReplay,
-    FailureRow,
-    FleetRetention,
-    PictureRow,
-    TraceRow,
-)
 from mapserver.store.schema import names
 
 Key = tuple[str, str, str]
@@ -35,13 +26,13 @@ LastReports = dict[tuple[str, str], LastReport]
 """By (site, robot)."""
 
 _DAY_NS = 86_400_000_000_000
-_USUAL_RETENTION = FleetRetention()
+_USUAL_RETENTION = records.FleetRetention()
 _PRUNED_SHARE = 0.95  # of the limit of pictures' bytes: pruning to this share avoids a new sum at each picture
 _SHRINK_PAGES = 20_000  # 80 MB, to keep waiting times short
 _SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
 _ADD = ", ".join(f"{name} = tallies.{name} + excluded.{name}" for name in COUNTER_COLUMNS)
 _KEYS_AT_ONCE = 100
-_TRACED = names(TraceRow).removeprefix("site, robot, ")
+_TRACED = names(records.TraceRow).removeprefix("site, robot, ")
 _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
 _NO_FAILURE = "failure {} does not exist; the list of failures shows the stored ones"
 
@@ -50,7 +41,7 @@ class FleetBatch(msgspec.Struct):
     """Data since the last batch."""
 
     counters: dict[CounterKey, Counters] = {}
-    traces: list[TraceRow] = []
+    traces: list[records.TraceRow] = []
     last_reports: LastReports = {}
 
     def add(self, site: str, axis: str, key: str, hour: int, counts: Counters) -> None:
@@ -81,7 +72,7 @@ class FleetQueries:
         report: FailureReport,
         times_ns: tuple[int, int],
         counters: Mapping[CounterKey, Counters],
-        retention: FleetRetention = _USUAL_RETENTION,
+        retention: records.FleetRetention = _USUAL_RETENTION,
         area: str | None = None,
     ) -> bool:
         """Store a failure and its sums durably; False (and no change) for a known one.
@@ -146,23 +137,23 @@ class FleetQueries:
     def _sums(
         self, sums: str, by: str, order: str, site: str | None, axis: str, key: str | None, since: int, until: int
     ) -> list[dict[str, Any]]:
-        if axis not in AXES:
-            raise UsageError(f"unknown axis {axis!r}; choose one of {', '.join(AXES)}")
+        if axis not in records.AXES:
+            raise UsageError(f"unknown axis {axis!r}; choose one of {', '.join(records.AXES)}")
         wanted = {"k.axis": axis, "k.site": site, "k.key": key, "t.hour >=": since, "t.hour <": until}
         words, values = matching(wanted)
         tables = "tally_keys k JOIN tallies t ON t.key_id = k.id"
         return self._database.query(f"SELECT {sums} FROM {tables} WHERE {words} GROUP BY {by} ORDER BY {order}", values)
 
     def failures(
-        self, wanted: FailureFilter, *, before: int | None = None, limit: int | None = None
-    ) -> list[FailureRow]:
+        self, wanted: records.FailureFilter, *, before: int | None = None, limit: int | None = None
+    ) -> list[records.FailureRow]:
         columns = asdict(wanted) | {"number <": before}
         columns |= {"happened_ns >=": columns.pop("since_ns"), "happened_ns <": columns.pop("until_ns")}
-        return self._database.select(FailureRow, "failures", columns, "number DESC", limit)
+        return self._database.select(records.FailureRow, "failures", columns, "number DESC", limit)
 
-    def failure(self, number: int) -> FailureDetail:
+    def failure(self, number: int) -> records.FailureDetail:
         """Return one failure with its context; raises UsageError if it does not exist. An unreadable report has its row's columns only."""
-        rows = self._database.select(FailureRow, "failures", {"number": number}, "number")
+        rows = self._database.select(records.FailureRow, "failures", {"number": number}, "number")
         if not rows:
             raise UsageError(_NO_FAILURE.format(number))
         data = self._database.value("SELECT report FROM failures WHERE number = ?", (number,))
@@ -176,7 +167,7 @@ class FleetQueries:
                 id=rows[0].failure_id, stamp_ns=at_ns, wall_ns=at_ns, calibration=words[:2000], **known
             )
         query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
-        return FailureDetail(rows[0], report, self._database.rows(PictureRow, query, (number,)))
+        return records.FailureDetail(rows[0], report, self._database.rows(records.PictureRow, query, (number,)))
 
     def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
         """Return the number of a robot's report, None if not stored."""
@@ -204,7 +195,7 @@ class FleetQueries:
                     AND number IN ({", ".join("?" * len(wanted))}) GROUP BY number"""
         return {row["number"]: row["place"] for row in self._database.query(query, wanted)} if wanted else {}
 
-    def add_replay(self, number: int, replay: FailureReplay, keep_bytes: int) -> None:
+    def add_replay(self, number: int, replay: records.FailureReplay, keep_bytes: int) -> None:
         """Store a failure's recording, and its pictures with those of the failure; the oldest recordings are deleted, never this one."""
         row = {"number": number, "summary": replay.summary, "mcap": replay.mcap}
         with self._database.write() as change:
@@ -230,13 +221,13 @@ class FleetQueries:
             )
         return bytes(mcap)
 
-    def trace(self, site: str, robot: str, *, since_hour: int = 0, until_hour: int = 1 << 60) -> list[TraceRow]:
+    def trace(self, site: str, robot: str, *, since_hour: int = 0, until_hour: int = 1 << 60) -> list[records.TraceRow]:
         """Return a robot's trace, oldest first, hour by hour: in the table, an hour's rows of other robots lie in between."""
         (ends,) = self._database.query("SELECT min(hour) first, max(hour) last FROM traces")
         if ends["first"] is None:
             return []
         return self._database.rows(
-            TraceRow,
+            records.TraceRow,
             f"""WITH RECURSIVE asked(at) AS (
                     SELECT CAST(? AS BIGINT) UNION ALL SELECT at + 1 FROM asked WHERE at < ?)
                SELECT k.site, k.key robot, {_TRACED}
@@ -245,7 +236,7 @@ class FleetQueries:
             (max(since_hour, ends["first"]), min(until_hour - 1, ends["last"]), until_hour, site, robot),
         )
 
-    def prune(self, retention: FleetRetention) -> int:
+    def prune(self, retention: records.FleetRetention) -> int:
         """Remove old or excess data; return the number of removed rows."""
         with self._database.write(durable=False) as change:
             gone = 0
@@ -260,12 +251,12 @@ class FleetQueries:
         self._database.shrink(_SHRINK_PAGES)
         return int(gone)
 
-    def expired(self, retention: FleetRetention) -> dict[str, int]:
+    def expired(self, retention: records.FleetRetention) -> dict[str, int]:
         """Return by name how many rows are older than their period."""
         rows = self._expired(retention).items()
         return {name: int(self._database.value(f"SELECT count(*) FROM {old}", (ns,))) for name, (old, ns) in rows}
 
-    def _expired(self, retention: FleetRetention) -> dict[str, tuple[str, int]]:
+    def _expired(self, retention: records.FleetRetention) -> dict[str, tuple[str, int]]:
         """Return by name the rows older than their period, as a table with a condition, and the condition's parameter."""
         of_failures = "WHERE number IN (SELECT number FROM failures WHERE happened_ns < ?)"
 

@@ -29,18 +29,10 @@ from fleetmap.mapformat.names import check_name, current_path
 from fleetmap.mapformat.tile_codec import encode_tile
 from fleetmap.mapformat.version_file import ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
+from mapserver.store import files as disk
 from mapserver.store import upkeep
 from mapserver.store.blobs import Blobs
 from mapserver.store.database import Transaction, format_of
-from mapserver.store.files import (
-    check_no_link,
-    is_plain_file,
-    keep_reserve,
-    locked,
-    make_folder,
-    make_own_file,
-    read_chunks,
-)
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.places import DATABASE, Places, open_database, open_objects, read_places, write_places
 from mapserver.store.queries import EXTRA_TABLES, Release, StoreQueries
@@ -90,10 +82,10 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
         if read_only and 0 < format_of(file) < FORMAT:
             return cls(path, clock_ns, read_only=True)
         try:
-            make_folder(path / "sites")
+            disk.make_folder(path / "sites")
             if is_new:
-                make_own_file(file)
-                keep_reserve(path)
+                disk.make_own_file(file)
+                disk.keep_reserve(path)
             return cls(path, clock_ns)
         except (OSError, sqlite3.Error, StoreError) as error:
             if read_only:
@@ -123,7 +115,7 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
                     f"{path} holds no map store; name the content and the database of the one that it shall share"
                 )
             open_database(path, places, time.time_ns, create=False, read_only=True).close()
-            make_folder(path)
+            disk.make_folder(path)
             write_places(path, places)
             return 0
         with cls.open(path) as store, store._bytes(shared=False), store.served(shared=False):
@@ -158,7 +150,7 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
 
     def served(self, *, shared: bool = True) -> AbstractContextManager[None]:
         """Note for the block that a server has the store in this folder open; BusyError for its exclusive use while one has."""
-        return locked(self.folder / "served.lock", shared=shared, waits=False)
+        return disk.locked(self.folder / "served.lock", shared=shared, waits=False)
 
     def close(self) -> None:
         self._database.close()
@@ -339,7 +331,7 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
         with self._bytes(shared=False):
             garbage = upkeep.collect(self._database, self._blobs, retention, actor)
             self._database.shrink(1 << 30)
-            keep_reserve(self.folder)
+            disk.keep_reserve(self.folder)
             return garbage
 
     def remove_survey_pictures(self, days: float, *, dry_run: bool = False) -> int:
@@ -423,7 +415,8 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
         currents = self._database.query("SELECT site, manifest_sha256 FROM versions WHERE state = 'current'")
         for row in currents if self._blobs.is_folder else ():
             path = self.folder / current_path(row["site"])
-            if not is_plain_file(path) or b"".join(read_chunks(path)) != f"{row['manifest_sha256']}\n".encode():
+            line = f"{row['manifest_sha256']}\n".encode()
+            if not disk.is_plain_file(path) or b"".join(disk.read_chunks(path)) != line:
                 self._write_current_file(row["site"])
 
     def _write_current_file(self, site: str) -> None:
@@ -432,12 +425,12 @@ class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
         with self._database.write(durable=False):
             current = self.current(site)
             assert current is not None
-            check_no_link(self.folder, path.parent)
+            disk.check_no_link(self.folder, path.parent)
             words = (
                 f"though version {current.version} is current; free some space and open the store again to repair it"
             )
             with disk_errors(f"{path} cannot be written", words):
-                make_folder(path.parent)
+                disk.make_folder(path.parent)
                 write_atomically(path, [f"{current.manifest_sha256}\n".encode()])
 
     @contextmanager

@@ -20,25 +20,12 @@ from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
+from mapserver.store import rows as records
 from mapserver.store.blobs import Blobs
 from mapserver.store.database import Database, SqliteDatabase, Transaction, matching
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.operators import OperatorQueries
 from mapserver.store.places import open_database, open_objects, read_places
-from mapserver.store.rows import (
-    INCIDENT,
-    NOBODY,
-    Actor,
-    AuditLine,
-    CanaryRow,
-    Event,
-    JobInfo,
-    RobotInfo,
-    SiteInfo,
-    SiteReleases,
-    VerdictRow,
-    VersionInfo,
-)
 from mapserver.store.survey_pictures import SurveyPicture, pictures_of
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
 
@@ -67,7 +54,7 @@ class StoreQueries:
         self.disk_space: Callable[[], DiskSpace] = DiskMeter(root, clock_ns).look
         self.usage: Callable[[], StoreUsage | None] = UsageMeter(root, self._database, self._blobs).look
         self._areas: dict[str, tuple[list[str], Areas]] = {}  # by the addresses of their source files
-        self._acts, self._acts_read, self._acts_lock = dict[str, list[Event]](), 0, threading.Lock()
+        self._acts, self._acts_read, self._acts_lock = dict[str, list[records.Event]](), 0, threading.Lock()
         # Every robot asks for requests every few seconds, and an object store answers slowly.
         self._request = lru_cache(_REQUESTS_KEPT)(lambda kind, sha256: read_request(kind, self._blobs.get(sha256)))
 
@@ -77,57 +64,59 @@ class StoreQueries:
 
     # ---------------------------------------------------------------------------------------------- sites and versions
 
-    def sites(self) -> list[SiteInfo]:
+    def sites(self) -> list[records.SiteInfo]:
         return self._database.rows(
-            SiteInfo,
+            records.SiteInfo,
             """SELECT s.site, (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
                (SELECT count(*) FROM versions v WHERE v.site = s.site) versions FROM sites s ORDER BY s.site""",
         )
 
-    def versions(self, site: str, *, after: int = 0, limit: int | None = None) -> list[VersionInfo]:
+    def versions(self, site: str, *, after: int = 0, limit: int | None = None) -> list[records.VersionInfo]:
         """Return versions of a site, oldest first, after number `after`."""
         self._check_site(site)
-        return self._database.select(VersionInfo, "versions", {"site": site, "version >": after}, "version", limit)
+        return self._database.select(
+            records.VersionInfo, "versions", {"site": site, "version >": after}, "version", limit
+        )
 
-    def version(self, site: str, version: int) -> VersionInfo:
+    def version(self, site: str, version: int) -> records.VersionInfo:
         """Return one version; UsageError if it does not exist."""
         self._check_site(site)
         if (found := self._version(site, version=version)) is None:
             raise UsageError(f"site {site} has no version {version}; `mapserver versions --site {site}` lists them")
         return found
 
-    def current(self, site: str) -> VersionInfo | None:
+    def current(self, site: str) -> records.VersionInfo | None:
         """Return the site's current version, None before the first publication."""
         if (found := self._version(site, state="current")) is None:
             self._check_site(site)
         return found
 
-    def releases(self, site: str) -> SiteReleases:
+    def releases(self, site: str) -> records.SiteReleases:
         """Return the present state of a site's releases, for decisions."""
         self._check_site(site)
         return site_releases(self._database, site)
 
-    def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
+    def canaries(self, site: str | None = None, *, running: bool = False) -> list[records.CanaryRow]:
         """Return canaries (of a site), latest first; with `running` only running ones."""
         wanted = {"site": site, "state": "running" if running else None}
-        return self._database.select(CanaryRow, "canaries", wanted, "id DESC")
+        return self._database.select(records.CanaryRow, "canaries", wanted, "id DESC")
 
-    def verdicts(self, site: str, version: int) -> list[VerdictRow]:
+    def verdicts(self, site: str, version: int) -> list[records.VerdictRow]:
         """Return the gate's verdicts on a version, oldest first; UsageError if it does not exist."""
         self.version(site, version)
         return [verdict for _, verdict in self._verdicts("site = ? AND version = ?", site, version)]
 
-    def last_verdicts(self, site: str) -> dict[int, VerdictRow]:
+    def last_verdicts(self, site: str) -> dict[int, records.VerdictRow]:
         """Return the gate's last verdict on each version of a site that it judged."""
         return dict(self._verdicts("id IN (SELECT max(id) FROM verdicts WHERE site = ? GROUP BY version)", site))
 
-    def _verdicts(self, condition: str, *values: object) -> list[tuple[int, VerdictRow]]:
+    def _verdicts(self, condition: str, *values: object) -> list[tuple[int, records.VerdictRow]]:
         """Return version and verdict, oldest first."""
         columns = "version, stamp_ns, accepted, forced, reasons, report"
         rows: list[dict[str, Any]] = self._database.rows(
             dict, f"SELECT {columns} FROM verdicts WHERE {condition} ORDER BY id", values
         )
-        return [(row["version"], msgspec.convert(row, VerdictRow, strict=False)) for row in rows]
+        return [(row["version"], msgspec.convert(row, records.VerdictRow, strict=False)) for row in rows]
 
     def evidence(self, site: str, version: int) -> Evidence | None:
         """Return the measurements of a version from its build, None if absent; errors as of `manifest`.
@@ -140,7 +129,7 @@ class StoreQueries:
             return carried_evidence(self.manifest(site, version))
         return msgspec.json.decode(figures, type=Evidence)
 
-    def trusted(self, info: VersionInfo) -> list[TrustedCalibration]:
+    def trusted(self, info: records.VersionInfo) -> list[TrustedCalibration]:
         """Return the calibrations of a version trusted by an operator; empty for a damaged manifest, which `verify` reports."""
         try:
             return trusted_calibrations(self.manifest(info.site, info.version))
@@ -245,28 +234,30 @@ class StoreQueries:
 
     # ---------------------------------------------------------------------------------------------------------- the log
 
-    def audit(self, kind: str, detail: str, *, actor: Actor = NOBODY, site: str = "") -> None:
+    def audit(self, kind: str, detail: str, *, actor: records.Actor = records.NOBODY, site: str = "") -> None:
         """Log an event that no other method writes, such as an enrolment, a signature or a refusal."""
         with self._database.write() as change:
             change.log(site, kind, detail, actor=actor)
 
     def events(
         self, site: str, span_ns: Span = (None, None), *, after: int = 0, limit: int | None = None
-    ) -> list[Event]:
+    ) -> list[records.Event]:
         """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
         wanted = {"site": site, "id >": after, "stamp_ns >=": span_ns[0], "stamp_ns <": span_ns[1]}
-        return self._database.select(Event, "events", wanted, "id", limit)
+        return self._database.select(records.Event, "events", wanted, "id", limit)
 
-    def last_events(self, site: str, limit: int) -> list[Event]:
+    def last_events(self, site: str, limit: int) -> list[records.Event]:
         """Return the last events of a site, the newest first, without what people did about incidents."""
-        return self._database.select(Event, "events", {"site": site, "kind <>": INCIDENT}, "id DESC", limit)
+        return self._database.select(
+            records.Event, "events", {"site": site, "kind <>": records.INCIDENT}, "id DESC", limit
+        )
 
-    def incident_acts(self) -> dict[str, list[Event]]:
+    def incident_acts(self) -> dict[str, list[records.Event]]:
         """Return what people did about each incident, by its id, oldest first. Only new lines are read: the log goes back for ever."""
         with self._acts_lock:
             last = self._database.value("SELECT max(id) FROM events") or 0
-            wanted = {"id >": self._acts_read, "id <=": last, "kind": INCIDENT}
-            for act in self._database.select(Event, "events", wanted, "id"):
+            wanted = {"id >": self._acts_read, "id <=": last, "kind": records.INCIDENT}
+            for act in self._database.select(records.Event, "events", wanted, "id"):
                 self._acts.setdefault(act.detail.partition(": ")[2], []).append(act)
             self._acts_read = last
             return dict(self._acts)
@@ -281,12 +272,12 @@ class StoreQueries:
         span_ns: Span = (None, None),
         before: int | None = None,
         limit: int | None = None,
-    ) -> list[AuditLine]:
+    ) -> list[records.AuditLine]:
         """Return lines of the log, the last first. kind: its beginning; of_people: not what the server did; before: a line."""
         by, start_ns, end_ns = "" if of_people else None, *span_ns
         wanted = {"site": site, "actor": person, "actor <>": by, "stamp_ns >=": start_ns, "stamp_ns <": end_ns}
         wanted |= {"kind LIKE": None if kind is None else f"{kind}%", "id <": before}
-        return self._database.select(AuditLine, "events", wanted, "id DESC", limit)
+        return self._database.select(records.AuditLine, "events", wanted, "id DESC", limit)
 
     def log_values(self, column: Literal["actor", "site", "kind"]) -> list[str]:
         """Return what lines of people have in a column of the log."""
@@ -294,11 +285,7 @@ class StoreQueries:
             f"SELECT DISTINCT {column} FROM events WHERE actor <> '' AND {column} <> '' ORDER BY {column}"
         )
 
-    def audit_lines(self) -> list[AuditLine]:
-        """Return the whole log, oldest first."""
-        return self.log()[::-1]
-
-    def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
+    def note_restored(self, detail: str, ahead: int, actor: records.Actor) -> None:
         """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
         with self._database.write() as change:
             change.execute("UPDATE sites SET last_version = last_version + ?", (ahead,))
@@ -310,9 +297,9 @@ class StoreQueries:
 
     # ----------------------------------------------------------------------------------------------------------- robots
 
-    def robots(self, site: str | None = None) -> list[RobotInfo]:
+    def robots(self, site: str | None = None) -> list[records.RobotInfo]:
         """Return the last report of every robot (of a site)."""
-        return self._database.select(RobotInfo, "robots", {"site": site}, "site, robot")
+        return self._database.select(records.RobotInfo, "robots", {"site": site}, "site, robot")
 
     def robot_names(self) -> set[tuple[str, str]]:
         return {(row["site"], row["robot"]) for row in self._database.query("SELECT site, robot FROM robots")}
@@ -324,7 +311,7 @@ class StoreQueries:
         with self._database.write(durable=False) as change:
             keep_last_reports(change, {(site, robot): (version, self.now_ns(), report)})
 
-    def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
+    def remove_robots(self, site: str, robots: Sequence[str], *, actor: records.Actor = records.NOBODY) -> list[str]:
         """Remove the last reports of a site's robots, and return the known ones; their counts and failures stay."""
         self._check_site(site)
         removed = []
@@ -344,25 +331,25 @@ class StoreQueries:
         *,
         before: int | None = None,
         limit: int | None = None,
-    ) -> list[JobInfo]:
+    ) -> list[records.JobInfo]:
         """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
         since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
         wanted = {"site": site, "id <": before, "started >=": since, "started <": until}
-        return self._database.select(JobInfo, "jobs", wanted, "id DESC", limit)
+        return self._database.select(records.JobInfo, "jobs", wanted, "id DESC", limit)
 
-    def job(self, number: int) -> JobInfo:
+    def job(self, number: int) -> records.JobInfo:
         """Return one job; UsageError if it does not exist."""
-        if found := self._database.select(JobInfo, "jobs", {"id": number}, "id"):
+        if found := self._database.select(records.JobInfo, "jobs", {"id": number}, "id"):
             return found[0]
         raise UsageError(f"job {number} does not exist; the list of jobs shows the stored ones")
 
-    def running_jobs(self) -> list[JobInfo]:
-        return self._database.select(JobInfo, "jobs", {"state": "running"}, "id")
+    def running_jobs(self) -> list[records.JobInfo]:
+        return self._database.select(records.JobInfo, "jobs", {"state": "running"}, "id")
 
-    def last_night(self, site: str) -> JobInfo | None:
+    def last_night(self, site: str) -> records.JobInfo | None:
         """Return the site's last ended nightly job; None before the first."""
         wanted = {"site": site, "kind": "nightly", "state <>": "running"}
-        return next(iter(self._database.select(JobInfo, "jobs", wanted, "id DESC", 1)), None)
+        return next(iter(self._database.select(records.JobInfo, "jobs", wanted, "id DESC", 1)), None)
 
     def sites_with_jobs(self) -> list[str]:
         """Return the sites with a job, also those without a version."""
@@ -395,18 +382,20 @@ class StoreQueries:
             known = ", ".join(info.site for info in self.sites()) or "none"
             raise UsageError(f"the store has no site {site}; it has: {known}")
 
-    def _version(self, site: str, **wanted: object) -> VersionInfo | None:
-        return next(iter(self._database.select(VersionInfo, "versions", {"site": site, **wanted}, "version")), None)
+    def _version(self, site: str, **wanted: object) -> records.VersionInfo | None:
+        return next(
+            iter(self._database.select(records.VersionInfo, "versions", {"site": site, **wanted}, "version")), None
+        )
 
 
-def site_releases(database: Database, site: str) -> SiteReleases:
+def site_releases(database: Database, site: str) -> records.SiteReleases:
     """Return the state of a site's releases; empty for an unknown site."""
-    versions = database.select(VersionInfo, "versions", {"site": site}, "version")
-    running = database.select(CanaryRow, "canaries", {"site": site, "state": "running"}, "id DESC")
+    versions = database.select(records.VersionInfo, "versions", {"site": site}, "version")
+    running = database.select(records.CanaryRow, "canaries", {"site": site, "state": "running"}, "id DESC")
     current = next((info.version for info in versions if info.state == "current"), None)
     query = "SELECT version FROM currents WHERE site = ? AND version <> ? ORDER BY id DESC LIMIT 1"
     files = database.query("SELECT kind, sha256 FROM site_files WHERE site = ? ORDER BY kind", (site,))
-    return SiteReleases(
+    return records.SiteReleases(
         site=site,
         versions={info.version: info for info in versions},
         rollback_target=None if current is None else database.value(query, (site, current)),
@@ -449,7 +438,9 @@ class Release:
             (self._site, self._site, version),
         )
 
-    def begin_canary(self, version: int, base_version: int, share: float, threshold: float, actor: Actor) -> None:
+    def begin_canary(
+        self, version: int, base_version: int, share: float, threshold: float, actor: records.Actor
+    ) -> None:
         """Begin a canary; its version, perhaps a draft, is published."""
         self.set_state(version, "published")
         row = {"site": self._site, "version": version, "base_version": base_version, "share": share}
@@ -461,7 +452,7 @@ class Release:
         query = "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE site = ? AND state = 'running'"
         self._change.execute(query, (state, self._now_ns, outcome, self._site))
 
-    def log(self, kind: str, detail: str, version: int, actor: Actor) -> None:
+    def log(self, kind: str, detail: str, version: int, actor: records.Actor) -> None:
         self._change.log(self._site, kind, detail, version, actor)
 
 

@@ -9,16 +9,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, get_args
 
 from mapserver.fleet_statistics.kpis import Counters
-from mapserver.store.rows import (
-    AuditLine,
-    CanaryRow,
-    FailureRow,
-    JobInfo,
-    OperatorRow,
-    RobotInfo,
-    TraceRow,
-    VersionInfo,
-)
+from mapserver.store import rows
 
 if TYPE_CHECKING:
     from sqlite_utils import Database
@@ -55,7 +46,7 @@ _COMPACT |= {"robots", "tallies", "traces"}
 
 TABLES = {
     "sites": "site TEXT PRIMARY KEY, last_version INTEGER NOT NULL DEFAULT 0",
-    "versions": f"""{_columns(VersionInfo)}, PRIMARY KEY (site, version), FOREIGN KEY (site) REFERENCES sites(site),
+    "versions": f"""{_columns(rows.VersionInfo)}, PRIMARY KEY (site, version), FOREIGN KEY (site) REFERENCES sites(site),
         CHECK (version >= 1), {_one_of("state", "draft", "published", "current", "retired")}""",
     "version_blobs": _blobs_of_version(
         "kind TEXT NOT NULL CHECK (kind IN ('manifest', 'tile', 'vocabulary', 'archive')), "
@@ -75,22 +66,22 @@ TABLES = {
     "verdicts": f"""id INTEGER PRIMARY KEY, site TEXT NOT NULL, version INTEGER NOT NULL, stamp_ns INTEGER NOT NULL,
         accepted INTEGER NOT NULL, forced INTEGER NOT NULL, reasons TEXT NOT NULL, report TEXT NOT NULL,
         CHECK (accepted IN (0, 1) AND forced IN (0, 1)), {_OF_VERSION}""",
-    "canaries": f"{_columns(CanaryRow)}, {_one_of('state', 'running', 'promoted', 'rolled_back', 'stopped')}",
-    "jobs": f"{_columns(JobInfo)}, {_one_of('state', 'running', 'done', 'failed')}",
-    "events": _columns(AuditLine).replace("TEXT NOT NULL", "TEXT NOT NULL DEFAULT ''"),  # the log
-    "operators": f"""{_columns(OperatorRow, "tokens", "sessions")}, PRIMARY KEY (name), CHECK (is_disabled IN (0, 1)),
+    "canaries": f"{_columns(rows.CanaryRow)}, {_one_of('state', 'running', 'promoted', 'rolled_back', 'stopped')}",
+    "jobs": f"{_columns(rows.JobInfo)}, {_one_of('state', 'running', 'done', 'failed')}",
+    "events": _columns(rows.AuditLine).replace("TEXT NOT NULL", "TEXT NOT NULL DEFAULT ''"),  # the log
+    "operators": f"""{_columns(rows.OperatorRow, "tokens", "sessions")}, PRIMARY KEY (name), CHECK (is_disabled IN (0, 1)),
         {_one_of("role", "viewer", "operator", "admin", "program")}""",
     "sessions": """sha256 TEXT PRIMARY KEY, name TEXT NOT NULL REFERENCES operators(name), begun_ns INTEGER NOT NULL,
         used_ns INTEGER NOT NULL""",
     "tokens": """sha256 TEXT PRIMARY KEY, name TEXT NOT NULL REFERENCES operators(name), scopes TEXT NOT NULL,
         ends_ns INTEGER NOT NULL""",
-    "robots": f"{_columns(RobotInfo)}, PRIMARY KEY (site, robot)",
+    "robots": f"{_columns(rows.RobotInfo)}, PRIMARY KEY (site, robot)",
     # What is counted by: an axis of `AXES` and a key of it
     "tally_keys": """id INTEGER PRIMARY KEY, site TEXT NOT NULL, axis TEXT NOT NULL, key TEXT NOT NULL,
         UNIQUE (site, axis, key)""",
     "tallies": f"key_id INTEGER NOT NULL, hour INTEGER NOT NULL, {_columns(Counters)}, PRIMARY KEY (key_id, hour)",
-    "traces": f"key_id INTEGER NOT NULL, {_columns(TraceRow, 'site', 'robot')}, PRIMARY KEY (hour, key_id, stamp_ns)",
-    "failures": f"{_columns(FailureRow)}, report BLOB NOT NULL, UNIQUE (site, robot, failure_id)",
+    "traces": f"key_id INTEGER NOT NULL, {_columns(rows.TraceRow, 'site', 'robot')}, PRIMARY KEY (hour, key_id, stamp_ns)",
+    "failures": f"{_columns(rows.FailureRow)}, report BLOB NOT NULL, UNIQUE (site, robot, failure_id)",
     "failure_pictures": """number INTEGER NOT NULL REFERENCES failures(number) ON DELETE CASCADE, place INTEGER NOT NULL,
         kind TEXT NOT NULL, stamp_ns INTEGER NOT NULL, jpeg BLOB NOT NULL, PRIMARY KEY (number, place)""",
     # The recording of the seconds around a failure, and its summary

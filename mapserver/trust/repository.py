@@ -9,19 +9,8 @@ from typing import Any, cast
 
 import msgspec
 from securesystemslib.signer import Key, Signer
+from tuf.api import metadata as tuf
 from tuf.api.exceptions import UnsignedMetadataError
-from tuf.api.metadata import (
-    DelegatedRole,
-    Delegations,
-    Metadata,
-    MetaFile,
-    Root,
-    Signed,
-    Snapshot,
-    TargetFile,
-    Targets,
-    Timestamp,
-)
 from tuf.api.serialization.json import JSONSerializer
 
 from fleetmap.errors import StateError, disk_errors
@@ -58,13 +47,13 @@ class ListRepository:
     def init(self, root_key: Signer) -> None:
         """Write the first root and targets; StateError if the store has some."""
         self.check_empty()
-        online, root = self.keys.signer("online") or self.keys.make("online"), Root(consistent_snapshot=True)
+        online, root = self.keys.signer("online") or self.keys.make("online"), tuf.Root(consistent_snapshot=True)
         for role in ("root", "targets"):
             root.add_key(root_key.public_key, role)
         for role in _ONLINE:
             root.add_key(online.public_key, role)
         # The root last: once it exists the store counts as signed.
-        self._sign("targets", Targets(delegations=Delegations(keys={}, roles={})), root_key)
+        self._sign("targets", tuf.Targets(delegations=tuf.Delegations(keys={}, roles={})), root_key)
         self._sign("root", root, root_key)
 
     def check_root_key(self, root_key: Signer) -> None:
@@ -103,10 +92,10 @@ class ListRepository:
     def delegate(self, site: str, key: Key, root_key: Signer) -> None:
         """Make this key the only one that signs the list of a site. StateError unless the root key signed."""
         targets, name = self.lists.read("targets"), site_role(site)
-        held = targets.delegations or Delegations(keys={}, roles={})
-        role = DelegatedRole(name, [], 1, terminating=True, paths=[manifest_target(site, "*")])
+        held = targets.delegations or tuf.Delegations(keys={}, roles={})
+        role = tuf.DelegatedRole(name, [], 1, terminating=True, paths=[manifest_target(site, "*")])
         roles = {**(held.roles or {}), name: role}
-        targets.delegations = Delegations(keys=held.keys, roles=roles)
+        targets.delegations = tuf.Delegations(keys=held.keys, roles=roles)
         targets.add_key(key, name)
         used = {keyid for known in roles.values() for keyid in known.keyids}
         targets.delegations.keys = {keyid: key for keyid, key in targets.delegations.keys.items() if keyid in used}
@@ -129,15 +118,15 @@ class ListRepository:
         """
         root, targets = self.lists.read("root"), self.lists.metadata("targets")
         _check(root, "targets", targets)
-        meta = {"targets.json": MetaFile(targets.signed.version)}
+        meta = {"targets.json": tuf.MetaFile(targets.signed.version)}
         number, stamped = self.lists.newest("snapshot"), 0
         # The last one, unless a replaced key signed it: then it cannot stay, despite the same content
-        before: Snapshot | None = None
+        before: tuf.Snapshot | None = None
         if number:
             last = self.lists.metadata("snapshot")
             with suppress(UnsignedMetadataError):
                 root.verify_delegate("snapshot", last.signed_bytes, last.signatures)
-                before = cast(Snapshot, last.signed)
+                before = cast(tuf.Snapshot, last.signed)
         for name in self.lists.site_roles():
             if newest := self.lists.newest(name):
                 entry = self._named(targets.signed, name, newest, before)
@@ -146,27 +135,29 @@ class ListRepository:
             stamped = self.lists.read(TIMESTAMP).version
         if before is None or before.meta != meta or self.ahead or not is_fresh("snapshot", before.expires, self.now):
             number += 1 + self.ahead
-            self._sign("snapshot", Snapshot(version=number, meta=meta), online)
-        stamp = Timestamp(version=stamped + 1 + self.ahead, snapshot_meta=MetaFile(number))
+            self._sign("snapshot", tuf.Snapshot(version=number, meta=meta), online)
+        stamp = tuf.Timestamp(version=stamped + 1 + self.ahead, snapshot_meta=tuf.MetaFile(number))
         self._sign(TIMESTAMP, stamp, online, judges=(root,))
 
-    def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
+    def _named(self, targets: tuf.Targets, name: str, newest: int, before: tuf.Snapshot | None) -> tuf.MetaFile | None:
         """Return the snapshot's entry of a site: its newest list, or the previous entry while another key must sign first.
 
         Robots refuse a snapshot that has lost a role, including roles of other sites.
         """
         try:
             _check(targets, name, self.lists.metadata(name))
-            return MetaFile(newest)
+            return tuf.MetaFile(newest)
         except StateError as error:
             _log.warning("robots get no new list yet: %s", error)
             return None if before is None else before.meta.get(f"{name}.json")
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _sign(self, role: str, signed: Signed, *signers: Signer, judges: Sequence[Root | Targets] = ()) -> None:
+    def _sign(
+        self, role: str, signed: tuf.Signed, *signers: Signer, judges: Sequence[tuf.Root | tuf.Targets] = ()
+    ) -> None:
         signed.expires = self.now + timedelta(days=DAYS.get(role, DAYS["site"]))
-        metadata = Metadata[Any](signed)
+        metadata = tuf.Metadata[Any](signed)
         for signer in signers:
             metadata.sign(signer, append=True)
         for judge in judges:
@@ -180,18 +171,18 @@ class ListRepository:
                     self.lists.path(role, old).unlink(missing_ok=True)
 
 
-def site_targets(site: str, admitted: Sequence[AdmittedVersion], number: int) -> Targets:
+def site_targets(site: str, admitted: Sequence[AdmittedVersion], number: int) -> tuf.Targets:
     """Return the list of a site with this number, unsigned."""
-    targets = Targets(version=number)
+    targets = tuf.Targets(version=number)
     for entry in admitted:
         about = {name: value for name, value in msgspec.structs.asdict(entry.about).items() if value not in (None, {})}
-        target = TargetFile(entry.length, {"sha256": entry.sha256}, manifest_target(site, entry.about.version))
+        target = tuf.TargetFile(entry.length, {"sha256": entry.sha256}, manifest_target(site, entry.about.version))
         target.unrecognized_fields["custom"] = about
         targets.targets[target.path] = target
     return targets
 
 
-def _check(judge: Root | Targets, role: str, metadata: Metadata[Any]) -> None:
+def _check(judge: tuf.Root | tuf.Targets, role: str, metadata: tuf.Metadata[Any]) -> None:
     try:
         judge.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
     except (UnsignedMetadataError, ValueError) as error:

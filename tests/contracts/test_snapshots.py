@@ -105,7 +105,7 @@ def test_log_of_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert {answer.status_code for answer in told} == {200}, [answer.text for answer in told]
         shown = (
             f"{line.site} {line.version} {line.kind}: {line.detail}; {line.actor}, {line.operator}: {line.reason}\n"
-            for line in server.store.audit_lines()
+            for line in server.store.log()[::-1]
         )
         assert is_as_kept("acts.txt", re.sub(r"[0-9a-f]{12,}", "...", "".join(shown)))
 

@@ -7,17 +7,7 @@ import msgspec
 import numpy as np
 import scipy
 
-from mapserver.plugins.acceptance.figures import (
-    ALL,
-    QUANTILES,
-    UNKNOWN_PLACE,
-    AreaFigures,
-    Count,
-    Figure,
-    Report,
-    fewest,
-    quantile,
-)
+from mapserver.plugins.acceptance import figures
 from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import Evidence, TileDirections, first_of
@@ -56,7 +46,9 @@ Found = tuple[str, str, Reason]
 """The area, drive or rig where something was found that must not be, what, and the reason."""
 
 
-def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fleet: Sequence[str]) -> Report:
+def judged(
+    report: figures.Report, settings: GateSettings, evidence: Evidence | None, fleet: Sequence[str]
+) -> figures.Report:
     """Return the report with verdict, reasons, table, what was not judged and what to survey again.
 
     A share counts against a limit if its 95 % interval lies below it. evidence: of the version's build. fleet: tiles that the robots'
@@ -76,25 +68,25 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
         verdict=f"NOT ACCEPTED: {site}: {first_of(reasons, 1)}." if reasons else accepted,
         is_accepted=not reasons,
         reasons=reasons,
-        figures=[Figure(*row[:4], None if row.reasons is None else not row.reasons) for row in rows],
+        figures=[figures.Figure(*row[:4], None if row.reasons is None else not row.reasons) for row in rows],
         survey_again=list(dict.fromkeys([*again, *fleet])),
         not_judged=list(_not_judged(report)),
     )
 
 
-def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
+def _of_frames(report: figures.Report, settings: GateSettings) -> Iterator[Row]:
     whole, tries = report.whole, report.whole.frames.tries
 
-    def unlocalized(area: AreaFigures) -> Reason:
+    def unlocalized(area: figures.AreaFigures) -> Reason:
         is_dark = report.darkest_grey is not None and area.grey is not None and area.grey <= report.darkest_grey
         why = f"too dark (grey level {area.grey:.0f} of 255)" if is_dark else "not localized"
         words = f"{area.name} is {why}: {area.frames.text} frames get a fix"
         return Reason(words, f"{area.name}: survey it{' with more light' if is_dark else ''}")
 
-    def half(area: AreaFigures) -> Count:
-        return Count() if _is_below(area.frames, settings) else area.darkness.get("1", Count())
+    def half(area: figures.AreaFigures) -> figures.Count:
+        return figures.Count() if _is_below(area.frames, settings) else area.darkness.get("1", figures.Count())
 
-    def dim(area: AreaFigures) -> Reason:
+    def dim(area: figures.AreaFigures) -> Reason:
         words = f"{area.name} is nearly too dark: with half its light {half(area).text} frames get a fix"
         return Reason(words, f"{area.name}: survey it with more light")
 
@@ -107,7 +99,7 @@ def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
         (f"with 1/{', 1/'.join(str(2**stop) for stop in STOPS[1:])} of the light", STOPS[1:], whole.darkness),
         (f"with a blur of {', '.join(map(str, BLUR_PX))} px", BLUR_PX, whole.blur),
     ):
-        yield Row(f"the same {words}", ", ".join(ladder.get(str(level), Count()).text for level in levels))
+        yield Row(f"the same {words}", ", ".join(ladder.get(str(level), figures.Count()).text for level in levels))
     wrong = [(area.wrong / area.frames.tries, area.name, str(area.wrong)) for area in report.areas if area.frames.tries]
     words = f"{whole.wrong} of {tries} frames are localized at a wrong place"
     over = [Reason(words)] if whole.wrong > settings.max_wrong_share * tries else [] if tries else None
@@ -115,19 +107,19 @@ def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
     yield Row("Frames localized at a wrong place", f"{whole.wrong} of {tries}", _worst(wrong), limit, over)
     limit_mm, median_mm = 1e3 * settings.max_median_error_m, float(np.median(whole.errors_mm or [0.0]))
     words = f"the median error is {median_mm:.0f} mm, the limit is {limit_mm:.0f} mm"
-    is_known = quantile(whole.errors_mm, 0.5) is not None
+    is_known = figures.quantile(whole.errors_mm, 0.5) is not None
     over = [Reason(words)] if median_mm > limit_mm else [] if is_known else None
-    medians = _worst(_errors((area.name, quantile(area.errors_mm, 0.5)) for area in report.areas))
+    medians = _worst(_errors((area.name, figures.quantile(area.errors_mm, 0.5)) for area in report.areas))
     yield Row(
         "Error of these frames, median", _mm(whole.errors_mm, "median"), medians, f"at most {limit_mm:g} mm", over
     )
     yield Row("Error of these frames, 95 %", _mm(whole.errors_mm, "p95"))
 
 
-def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
+def _of_robots(report: figures.Report, settings: GateSettings) -> Iterator[Row]:
     whole, drives, least = report.whole.starts, report.drives, settings.min_localised_share
 
-    def unfound(area: AreaFigures) -> Reason:
+    def unfound(area: figures.AreaFigures) -> Reason:
         starts, tries = area.starts, area.starts.found_of_all.tries
         if starts.ambiguous > starts.lost:
             alike = ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
@@ -167,10 +159,10 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
     yield Row("Largest distance at a dock passed", furthest)
 
 
-def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
+def _of_site(report: figures.Report, settings: GateSettings) -> Iterator[Row]:
     strays, one_way, doubted = list[Found](), list[Found](), list[Found]()
     for area in report.areas:
-        if area.name != UNKNOWN_PLACE and not area.places and not _is_below(area.frames, settings):
+        if area.name != figures.UNKNOWN_PLACE and not area.places and not _is_below(area.frames, settings):
             words = f"{area.name} was driven through, and is not in the map"
             strays.append((area.name, "no place", Reason(words, f"{area.name}: survey it")))
         if area.missing:
@@ -191,17 +183,17 @@ def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
 
 def _share(
     name: str,
-    report: Report,
+    report: figures.Report,
     settings: GateSettings,
-    of: Callable[[AreaFigures], Count],
-    reason: Callable[[AreaFigures], Reason],
+    of: Callable[[figures.AreaFigures], figures.Count],
+    reason: Callable[[figures.AreaFigures], Reason],
 ) -> Row:
     """Return a share's row; of areas with few tries each, which judge none of them, all together may be below the limit.
 
     A share that is below, as chance may have it, is neither within its limit nor a reason.
     """
-    count = sum(map(of, report.areas), Count())
-    areas = [area for area in report.areas if area.name != UNKNOWN_PLACE and of(area).tries]
+    count = sum(map(of, report.areas), figures.Count())
+    areas = [area for area in report.areas if area.name != figures.UNKNOWN_PLACE and of(area).tries]
     reasons = [reason(area) for area in areas if _is_below(of(area), settings)]
     if not reasons and _is_below(count, settings):
         reasons = [Reason(f"{name}: only {count.text}", "all areas: survey them")]
@@ -220,7 +212,7 @@ def _none(name: str, found: Sequence[Found], number: int | None = None, *, is_tr
     return Row(name, str(len(found) if number is None else number), named, "none", reasons)
 
 
-def _is_below(count: Count, settings: GateSettings) -> bool:
+def _is_below(count: figures.Count, settings: GateSettings) -> bool:
     high = count.share.high
     return high is not None and high < settings.min_localised_share
 
@@ -231,7 +223,7 @@ def _errors(named_mm: Iterable[tuple[str, float | None]]) -> list[Part]:
 
 def _mm(values: Sequence[float], name: str) -> str:
     """Return a quantile as text, or that there are too few values for it."""
-    found, least = quantile(values, QUANTILES[name]), fewest(QUANTILES[name])
+    found, least = figures.quantile(values, figures.QUANTILES[name]), figures.fewest(figures.QUANTILES[name])
     return f"too few: {len(values)} of {least}" if found is None else f"{found:.1f} mm"
 
 
@@ -241,7 +233,7 @@ def _worst(parts: Sequence[Part]) -> str:
     return f"{worst[1]}: {worst[2]}" if any(part[0] < worst[0] for part in parts) else ""
 
 
-def _not_judged(report: Report) -> Iterator[str]:
+def _not_judged(report: figures.Report) -> Iterator[str]:
     hours = sum(drive.hours for drive in report.drives)
     for drive in report.drives:
         if drive.is_surveyed:
@@ -251,7 +243,7 @@ def _not_judged(report: Report) -> Iterator[str]:
         if not drive.docks_mm:
             yield f"{drive.name} passed no dock: nothing beside the map judges its position"
     for area in report.areas:
-        if area.name == UNKNOWN_PLACE:
+        if area.name == figures.UNKNOWN_PLACE:
             yield f"{area.starts.found_of_all.tries} starts were at a place that is not known"
         elif area.places and not area.frames.tries:
             yield f"{area.name}: no drive was there"
@@ -263,10 +255,10 @@ def _not_judged(report: Report) -> Iterator[str]:
         yield f"the rate of incidents, by {hours:.2f} h of driving: {quiet}"
 
 
-def compared(report: Report, before: Report) -> Report:
+def compared(report: figures.Report, before: figures.Report) -> figures.Report:
     """Return the report with what is better and worse than before, beyond chance: Fisher's exact test of counts, Mann and Whitney's test
     of errors, both at a level of 5 % for all comparisons together (Bonferroni)."""
-    then = {area.name: area for area in before.areas} | {ALL: before.whole}
+    then = {area.name: area for area in before.areas} | {figures.ALL: before.whole}
     pairs = [(area, then[area.name]) for area in (report.whole, *report.areas) if area.name in then]
     tests = [(words, p, is_better) for now, old in pairs for words, p, is_better in _tests(now, old)]
     sure = [(words, is_better) for words, p, is_better in tests if p * len(tests) < _LEVEL]
@@ -284,7 +276,7 @@ def compared(report: Report, before: Report) -> Report:
     return msgspec.structs.replace(report, compared_with=name, better=better, worse=worse)
 
 
-def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, bool]]:
+def _tests(now: figures.AreaFigures, old: figures.AreaFigures) -> Iterator[tuple[str, float, bool]]:
     """Yield each figure of an area as text with the probability that chance changed it as much, and if it is better now."""
     counts = {"frames localized": (now.frames, old.frames)}
     counts["starts found"] = now.starts.found_of_all, old.starts.found_of_all
@@ -299,7 +291,7 @@ def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, boo
             p = float(scipy.stats.fisher_exact(table).pvalue)
             is_better = mine.hits * other.tries > other.hits * mine.tries
             yield f"{now.name}: {mine.text} {name}, {other.text} before", p, is_better
-    medians = quantile(now.errors_mm, 0.5), quantile(old.errors_mm, 0.5)
+    medians = figures.quantile(now.errors_mm, 0.5), figures.quantile(old.errors_mm, 0.5)
     if medians[0] is not None and medians[1] is not None:
         p = float(scipy.stats.mannwhitneyu(now.errors_mm, old.errors_mm).pvalue)
         yield f"{now.name}: median error {medians[0]:.1f} mm, {medians[1]:.1f} mm before", p, medians[0] < medians[1]

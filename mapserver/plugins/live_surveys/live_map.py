@@ -14,18 +14,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
 from fleetmap.messages import Cause, EstimateMessage, Placement, Status, covariance_entries
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from mapserver.plugins.live_surveys.message import (
-    MOST_PLACES,
-    NO_PART,
-    LiveMissing,
-    LivePart,
-    LiveRevisit,
-    MapSketch,
-    NewKeyframe,
-    joined_imu,
-    packed,
-    thinning,
-)
+from mapserver.plugins.live_surveys import message
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
 from mapserver.survey.bundle.problem import MotionPrior
@@ -67,7 +56,7 @@ class LiveMap:
         if rectifier.camera.baseline_m == 0:
             self._depths = MonoDepths([], self._mounted.camera, options.settings)
         self._keyframes: list[Keyframe] = []
-        self._news: list[NewKeyframe] = []
+        self._news: list[message.NewKeyframe] = []
         self._chain_from_body: list[Array] = []  # adjusted in windows, not moved by loops
         self._walked_m2: list[float] = [0.0]
         self._pairs: list[PairMatch] = []
@@ -97,7 +86,7 @@ class LiveMap:
         parts = [p @ t[:3, :3].T + t[:3, 3] for p, t in zip(self._points_body, self.map_from_body, strict=True)]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
-    def sketch(self, cells: Array, missing: list[LiveMissing]) -> MapSketch:
+    def sketch(self, cells: Array, missing: list[message.LiveMissing]) -> message.MapSketch:
         """Return the displayed data of the map; no array exceeds the limit of a message. cells, missing: of the drive, as in it."""
         found, refused, best = self._loops(), Counter[str](), dict[int, LoopRecord]()
         for record in found.records:
@@ -106,7 +95,7 @@ class LiveMap:
             if record.inliers > (best[record.i].inliers if record.i in best else 0):
                 best[record.i] = record
         newest = [
-            LiveRevisit(
+            message.LiveRevisit(
                 at_s=self._seconds(r.i),
                 seen_s=self._seconds(r.j),
                 verdict=r.verdict.value,
@@ -117,18 +106,18 @@ class LiveMap:
         ]
         accepted = [(r.i, r.j) for r in found.records if r.verdict is LoopVerdict.ACCEPTED]
         places_m, (labels, spans) = self.map_from_body[:, :2, 3], self.parts()
-        numbers = np.where((labels < 0) | (labels >= NO_PART), NO_PART, labels).astype(np.uint8)
-        return MapSketch(
+        numbers = np.where((labels < 0) | (labels >= message.NO_PART), message.NO_PART, labels).astype(np.uint8)
+        return message.MapSketch(
             keyframes=len(self),
-            path_m=packed(places_m),
-            part=numbers[thinning(len(numbers), MOST_PLACES)].tobytes(),
-            parts=spans[:NO_PART],
-            landmarks_m=packed(self.points_map()[:, :2]),
-            loops_m=packed(places_m[np.array(accepted, np.int64).reshape(-1, 2)].reshape(-1, 4)),
+            path_m=message.packed(places_m),
+            part=numbers[message.thinning(len(numbers), message.MOST_PLACES)].tobytes(),
+            parts=spans[: message.NO_PART],
+            landmarks_m=message.packed(self.points_map()[:, :2]),
+            loops_m=message.packed(places_m[np.array(accepted, np.int64).reshape(-1, 2)].reshape(-1, 4)),
             loops=len(accepted),
             refused=dict(refused),
             revisits=newest,
-            cells=packed(cells),
+            cells=message.packed(cells),
             missing=missing,
             estimate=self._estimate(labels, spans),
         )
@@ -137,7 +126,7 @@ class LiveMap:
         """All candidates so far, and the loops accepted by the pose graph."""
         return Loops() if self._closer is None else self._closer.loops.without_outliers(self._loop_weights)
 
-    def parts(self) -> tuple[NDArray[np.int64], list[LivePart]]:
+    def parts(self) -> tuple[NDArray[np.int64], list[message.LivePart]]:
         """Return the parts that tracking, odometry and accepted loops connect: labels (K,) number them by time, -1 for keyframes that saw
         too little. Only the one with the most keyframes can be the map: parts still separate at the end are left out.
         """
@@ -152,14 +141,14 @@ class LiveMap:
             labels[part] = number
         largest = int(np.argmax([self._seeing[m].sum() for m in members])) if members else 0
         spans = [
-            LivePart(
+            message.LivePart(
                 start_s=self._seconds(m[0]), end_s=self._seconds(m[-1]), keyframes=len(m), is_map=number == largest
             )
             for number, m in enumerate(members)
         ]
         return labels, spans
 
-    def _estimate(self, labels: NDArray[np.int64], spans: list[LivePart]) -> EstimateMessage | None:
+    def _estimate(self, labels: NDArray[np.int64], spans: list[message.LivePart]) -> EstimateMessage | None:
         """Return the pose of the base at the newest keyframe in the growing map, relative to its first one, in the robots' form with
         odometry's continuous frame as `odom`; LOST while in another part. None for a single keyframe."""
         newest, placed, cov = len(self) - 1, None, None
@@ -197,7 +186,7 @@ class LiveMap:
     def _seconds(self, k: int) -> float:
         return round((self._keyframes[k].stamp_ns - self._keyframes[0].stamp_ns) * 1e-9, 3)
 
-    def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
+    def add(self, frame: RectifiedFrame, new: message.NewKeyframe) -> None:
         """Add one more keyframe: match and adjust it with its neighbours, and compare it with all earlier ones."""
         keyframe = make_keyframe(frame, new.number, self._rectifier.camera, self._settings)
         self._keyframes.append(keyframe)
@@ -316,7 +305,7 @@ class LiveMap:
         motions_body = np.array([new.motion_body for new in news])
         motion = KeyframeMotion(
             inertial=inertial,
-            imu=joined_imu([new.imu for new in news]),
+            imu=message.joined_imu([new.imu for new in news]),
             noise=noise,
             imu_minus_cam_s=self._rectifier.imu_minus_cam_s,
             motions=turned(motions_body, level_from_body[:, :3, :3]),

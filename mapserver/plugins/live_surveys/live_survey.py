@@ -24,16 +24,9 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import Image, ImuSamples, WheelSample
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
+from mapserver.plugins.live_surveys import message
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
 from mapserver.plugins.live_surveys.mapping_process import MappingProcess
-from mapserver.plugins.live_surveys.message import (
-    MAX_ARRAY_BYTES,
-    MOST_PLACES,
-    LiveSurveyState,
-    NewKeyframe,
-    joined_imu,
-    thinning,
-)
 from mapserver.survey.odometry_pass import OdometryRun
 from mapserver.survey.pose_graph.odometry_factors import FLOOR, INERTIAL_FLOOR, step_covariance
 from mapserver.survey.settings import SurveySettings
@@ -53,7 +46,7 @@ class Tracked(NamedTuple):
 
     frame: RectifiedFrame
     quality: float
-    keyframe: NewKeyframe | None
+    keyframe: message.NewKeyframe | None
     pixels: Array | None = None
 
 
@@ -87,9 +80,9 @@ class LiveTracking:
             self._torn_m2 += _TORN_M2  # a new start has its own scale
         return False
 
-    def _keyframe(self, tracked: TrackedFrame) -> NewKeyframe:
+    def _keyframe(self, tracked: TrackedFrame) -> message.NewKeyframe:
         estimate, covariance, frame_from_body = tracked.estimate, self._run.chain.covariance, tracked.frame_from_body
-        step_cov, imu = None, joined_imu(self._imu)
+        step_cov, imu = None, message.joined_imu(self._imu)
         if self._before is not None:
             cov_before, frame_before, torn_before_m2 = self._before
             least = INERTIAL_FLOOR if estimate.inertial else FLOOR
@@ -100,7 +93,7 @@ class LiveTracking:
         velocity_body_mps = estimate.odom_from_body[:3, :3].T @ estimate.velocity_odom_mps
         self._before = covariance, frame_from_body, self._torn_m2
         self._imu = []
-        return NewKeyframe(
+        return message.NewKeyframe(
             number=tracked.number,
             frame_from_body=frame_from_body,
             level_from_frame=self._run.chain.level_from_frame,
@@ -112,7 +105,7 @@ class LiveTracking:
         )
 
 
-Tell = Callable[[LiveSurveyState], None]
+Tell = Callable[[message.LiveSurveyState], None]
 See = Callable[[Tracked], None]
 
 
@@ -120,7 +113,7 @@ class LiveFigures(NamedTuple):
     """A survey's state, and how well mapping kept up. most_behind: largest queue of keyframes; lag_s: longest time from a keyframe to the
     map that shows it. dropped: frames that arrived too fast."""
 
-    state: LiveSurveyState
+    state: message.LiveSurveyState
     most_behind: int
     lag_s: float
     dropped: int
@@ -231,14 +224,15 @@ class _Survey:
         for tell in self._tells:
             tell(state)
 
-    def state(self, phase: str, version: int | None = None, words: str = "") -> LiveSurveyState:
+    def state(self, phase: str, version: int | None = None, words: str = "") -> message.LiveSurveyState:
         sketch, stamps_ns = self._mapping.sketch, self._stamps_ns or [0]  # the thread of mapping replaces the sketch
-        qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
+        shown = message.thinning(sketch.keyframes, message.MOST_PLACES)
+        qualities = np.array(self._qualities[: sketch.keyframes])[shown]
         latencies_s, late_frames = np.array(self._latencies_s), 0
         if len(latencies_s) > 1:  # processed later than the time to the next frame
             period_s = float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed
             late_frames = int(np.sum(latencies_s > period_s))
-        return LiveSurveyState(
+        return message.LiveSurveyState(
             **structs.asdict(sketch) | {"keyframes": len(self._qualities)},
             site=self._drive.request.site,
             recording=self._drive.name[:200],
@@ -263,7 +257,7 @@ class _Survey:
         height, width = (-(-_PICTURE_PX * side // max(self._seen.shape)) for side in self._seen.shape)
         small = cv2.resize(self._seen, (width, height), interpolation=cv2.INTER_AREA)
         data = jpeg_image(np.asarray(small, np.uint8), _PICTURE_QUALITY).data
-        return data if len(data) <= MAX_ARRAY_BYTES else b""
+        return data if len(data) <= message.MAX_ARRAY_BYTES else b""
 
 
 @contextmanager

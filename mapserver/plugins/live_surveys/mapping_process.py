@@ -18,13 +18,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.plugins.live_surveys.live_map import LiveMap
-from mapserver.plugins.live_surveys.message import (
-    COVERAGE_CELL_M,
-    MAX_ARRAY_BYTES,
-    LiveMissing,
-    MapSketch,
-    NewKeyframe,
-)
+from mapserver.plugins.live_surveys.message import COVERAGE_CELL_M, MAX_ARRAY_BYTES, LiveMissing, MapSketch, NewKeyframe
 from mapserver.quality.directions import tile_directions
 from mapserver.survey.survey_inputs import SurveyConfig
 

@@ -173,7 +173,7 @@ def test_each_role_may_what_it_may(server: Server, name: str, reads: int, sees_m
         assert client.get("/v1/sites", headers=headers).status_code == reads
         assert client.get("/metrics", headers=headers).status_code == sees_metrics
         assert client.post(PUBLISH, json={"reason": "monday"}, headers=headers).status_code == changes
-        last = server.store.audit_lines()[-1]
+        last = server.store.log()[0]
         expected = ("published", name, name) if changes == 200 else ("refused", name, name)
         assert (last.kind, last.actor, last.operator, last.address) == (*expected, "testclient")
         forged = client.post("/v1/sites/lab/rollback", json={"actor": "bob"}, headers=headers)

@@ -100,7 +100,7 @@ def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
             answers = [pool.submit(server.client.post, "/v1/incidents/acknowledge", json=asked) for _ in range(4)]
         assert sorted(each.result().status_code for each in answers) == [200, 409, 409, 409], "one of them has it"
         assert "\x1b" not in run(app, "incidents", "list", "--store", folder, "--inbox", tmp_path / "inbox")
-        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines()][-7:-2]
+        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.log()[::-1]][-7:-2]
         assert done == ["acknowledged", "handed to Bob B", "commented", "closed", "reopened"]
         act(server, "acknowledge", FAILURE)
         server.store.fleet.remove_failure(1)

@@ -61,7 +61,7 @@ def test_each_address_asks_for_its_right(server: Server, named: dict[str, dict[s
             check_problem(client.post(path, json=body | WHY, headers=headers), 403, f"the right to {right!r}")
     for path, body, _ in ACTS:
         assert client.post(path, json=body | WHY, headers=named["ada"]).status_code == 200, path
-        last = server.store.audit_lines()[-1]
+        last = server.store.log()[0]
         assert (last.actor, last.operator, last.reason) == ("ada", "ada", "monday"), path
     assert {row["name"]: row["is_disabled"] for row in client.get("/v1/operators", headers=named["ada"]).json()["items"]} == {
         "ada": False, "bob": False, "ci": False, "olga": True, "program": False, "vic": False,
@@ -169,7 +169,7 @@ def test_one_of_two_tokens_is_revoked(server: Server, named: dict[str, dict[str,
             break
     left = [client.get("/v1/sites", headers=headers).status_code for headers in (first, second)]
     assert (sorted(left), len(tokens())) == ([200, 401], 1)
-    assert [(line.kind, line.detail) for line in server.store.audit_lines()][-1] == ("token revoked", "ci: read")
+    assert [(line.kind, line.detail) for line in server.store.log()[::-1]][-1] == ("token revoked", "ci: read")
 
 
 def test_secrets_are_in_one_answer_alone(
@@ -192,7 +192,7 @@ def test_secrets_are_in_one_answer_alone(
     told = [client.get(path, headers=ada).text for path in paths]
     kept = [path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file()]
     for secret in secrets:
-        assert not [text for text in (*told, *kept, caplog.text, str(server.store.audit_lines())) if secret in text]
+        assert not [text for text in (*told, *kept, caplog.text, str(server.store.log()[::-1])) if secret in text]
     (shown,) = [row for row in client.get("/v1/operators", headers=ada).json()["items"] if row["name"] == "olga"]
     assert (shown["role"], shown["sessions"], [row["scopes"] for row in shown["tokens"]]) == ("operator", 1, [["read"]])
 

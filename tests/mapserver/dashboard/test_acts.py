@@ -447,7 +447,7 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         expect(robots).to_contain_text("No robot was ever heard here")
 
         with MapStore.open(tmp_path) as store:
-            kinds = [line.kind for line in store.audit_lines() if line.actor == "bob" and line.reason == "a new shift"]
+            kinds = [line.kind for line in store.log()[::-1] if line.actor == "bob" and line.reason == "a new shift"]
             robots = ["robot enrolled", "robot revoked", "robot removed", "robot removed"]
             assert kinds == ["token made", "operator disabled", *robots]
             store.operators.set_role("bob", "viewer", Actor("root"))

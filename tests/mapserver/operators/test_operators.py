@@ -39,7 +39,7 @@ def operators(metadata_folder: Path, clock: Clock) -> Iterator[Operators]:
 
 
 def lines(operators: Operators) -> list[str]:
-    return [f"{line.kind}: {line.detail}" for line in operators._store.audit_lines()]
+    return [f"{line.kind}: {line.detail}" for line in operators._store.log()[::-1]]
 
 
 def test_a_clock_that_was_ahead_leaves_neither_long_sessions_nor_lost_tokens(

@@ -183,5 +183,5 @@ def test_text_from_outside_is_kept_alike(metadata_folder: Path) -> None:
         store.update_job(number, "failed", "topic /a\0 cannot be read", {"topic": "/a\0"})
         store.audit("note", "a\0b", actor=Actor("ada", "\0"))
         assert store.job(number).report == {"topic": "/a\0"}
-        assert [(line.detail, line.reason) for line in store.audit_lines()] == [(r"a\x00b", r"\x00")]
-        assert chain_faults(store.audit_lines()) == []
+        assert [(line.detail, line.reason) for line in store.log()[::-1]] == [(r"a\x00b", r"\x00")]
+        assert chain_faults(store.log()[::-1]) == []

@@ -177,7 +177,7 @@ def run(
             for axis, key in (("site", ""), ("cause", "dark"), ("tile", "0,0")):
                 counted = store.fleet.counters("lab", axis, key=key)["lab", key].failures
                 wrong += [f"{axis}: {counted} counted, {len(rows)} there"] if counted != len(rows) else []
-            wrong += store.verify().faults + chain_faults(store.audit_lines())
+            wrong += store.verify().faults + chain_faults(store.log()[::-1])
     asked, late_s = sum(robot.questions for robot in fleet), sorted(t for robot in fleet for t in robot.late_s)
     return {
         "robots": robots, "kills": kills, "acknowledged": len(kept), "questions": asked, "late": len(late_s),

@@ -124,7 +124,7 @@ def test_a_test_alert_says_what_the_receiver_answered(store: MapStore) -> None:
         assert f"status {status}" in answer.json()["detail"]
         (alert,) = json.loads(got[0][1])["alerts"]
         assert alert["labels"]["alertname"] == "FleetmapTest"
-        line = store.audit_lines()[-1]
+        line = store.log()[0]
         assert (line.kind, line.actor, line.reason) == ("alert_test", "ada", "new address")
     refused = ask(store, None)
     assert refused.status_code == 409

@@ -32,7 +32,7 @@ def test_a_store_moves_out_of_its_folder_and_back(tmp_path: Path, s3: str, postg
     with MapStore.open(folder, create=True) as store:
         publish_samples(store, 2)
         store.record_robot_report("lab", "r1", {"note": "caf\u00e9"}, 2)
-        tile, log = store.manifest("lab", 2).tiles[0].sha256, store.audit_lines()
+        tile, log = store.manifest("lab", 2).tiles[0].sha256, store.log()[::-1]
         data = store.blob(tile)
     with pytest.raises(StoreError, match="credentials"):
         MapStore.attach(folder, Places("s3://no-bucket-of-this-name"))
@@ -44,17 +44,17 @@ def test_a_store_moves_out_of_its_folder_and_back(tmp_path: Path, s3: str, postg
         MapStore.attach(tmp_path / "second", Places(s3, postgres.database()))
     MapStore.attach(tmp_path / "second", Places(f"{s3}-2", database))
     with MapStore.open(folder) as store, MapStore.open(tmp_path / "second") as second:
-        assert (store.audit_lines(), store.robots("lab")[0].last_report) == (log, {"note": "caf\u00e9"})
+        assert (store.log()[::-1], store.robots("lab")[0].last_report) == (log, {"note": "caf\u00e9"})
         publish_samples(second, 1)
         job = second.begin_job("lab", "build")
         second.tell_progress(job, {"stage": "bundle"})
         assert [info.state for info in store.versions("lab")] == ["published", "published", "current"]
-        assert store.verify().faults == chain_faults(store.audit_lines()) == []
+        assert store.verify().faults == chain_faults(store.log()[::-1]) == []
         back_up(store, target := BackupTarget(f"{s3}-backup", create=True))
     restore(target, tmp_path / "restored", ADA)
     with MapStore.open(tmp_path / "restored") as restored:
         assert restored.verify().faults == []
-        assert chain_faults(restored.audit_lines()) == []
+        assert chain_faults(restored.log()[::-1]) == []
         assert (restored.blob(tile), restored.jobs()[0].report) == (data, {"progress": {"stage": "bundle"}})
         restored.update_job(job, "failed", "the server is gone", {})
     with pytest.raises(StoreError, match="holds a store already"):

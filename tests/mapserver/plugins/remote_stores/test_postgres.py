@@ -60,7 +60,7 @@ def test_a_database_that_was_restarted_is_found_again(folders: tuple[Path, Path]
         postgres.start()
         assert save_sample_draft(store, seed=5) == 2
         assert [info.site for info in store.sites()] == ["lab"]
-        assert chain_faults(store.audit_lines()) == []
+        assert chain_faults(store.log()[::-1]) == []
 
 
 def test_who_lost_a_lock_writes_nothing_under_it(folders: tuple[Path, Path], postgres: PostgresServer) -> None:
@@ -124,8 +124,8 @@ def test_a_commit_without_an_answer_counts_once(
             else:
                 with pytest.raises(StoreError, match="network error" if end == "ROLLBACK" else "does not say whether"):
                     store.audit("note", "x")
-        assert [line.kind for line in store.audit_lines()].count("note") == (end != "ROLLBACK")
-        assert chain_faults(store.audit_lines()) == []
+        assert [line.kind for line in store.log()[::-1]].count("note") == (end != "ROLLBACK")
+        assert chain_faults(store.log()[::-1]) == []
 
 
 def test_a_write_does_not_wait_for_the_leader(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,7 +253,7 @@ def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
     with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other, ThreadPoolExecutor(4) as pool:
         for done in [pool.submit(each.audit, "note", str(n)) for n in range(40) for each in (store, other)]:
             done.result()
-        lines = store.audit_lines()
+        lines = store.log()[::-1]
         assert [line.kind for line in lines].count("note") == 80
         assert chain_faults(lines) == []
 
@@ -268,7 +268,7 @@ def test_who_waited_in_vain_for_its_turn_leaves_no_transaction(
         open_ones = "SELECT count(*) FROM pg_stat_activity WHERE state LIKE 'idle in transaction%'"
         assert store._database.value(open_ones) == 0
         other.audit("note", "now")
-        assert [line.detail for line in store.audit_lines()][-1:] == ["now"]
+        assert [line.detail for line in store.log()[::-1]][-1:] == ["now"]
 
 
 def test_a_writer_that_waited_sees_what_the_other_wrote(folders: tuple[Path, Path]) -> None:
@@ -287,8 +287,8 @@ def test_a_writer_that_waited_sees_what_the_other_wrote(folders: tuple[Path, Pat
         finally:
             with store._database.write() as connection:
                 connection.execute("ALTER ROLE fleet RESET default_transaction_isolation")
-        assert [line.detail for line in store.audit_lines()][-2:] == ["first", "second"]
-        assert chain_faults(store.audit_lines()) == []
+        assert [line.detail for line in store.log()[::-1]][-2:] == ["first", "second"]
+        assert chain_faults(store.log()[::-1]) == []
 
 
 def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -> None:
