@@ -22,12 +22,7 @@ from mapserver.survey.settings import SurveySettings
 _PRESETS = Path(__file__).parent / "presets"
 
 TIERS = {
-    "user": {
-        "": "site store",
-        "source": "kind sensors calibration recording device",
-        "topics": "*",
-        "alerts": "*",
-    },
+    "user": {"": "site store", "source": "kind sensors calibration recording device", "topics": "*", "alerts": "*"},
     "tuning": {
         "source": "speed width_px height_px rate_hz delay_s",
         "gate": "*",

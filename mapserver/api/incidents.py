@@ -64,9 +64,8 @@ def present(
         if named and site in (None, named[1]) and not acts[-1].detail.startswith("closed"):
             with suppress(UsageError):  # it was removed, or its time is over
                 failure = of_failure(store.fleet.failure(int(named[2])).failure)
-                found += (
-                    [failure] if acts[-1].stamp_ns >= failure.since_ns else []
-                )  # else of another one of this number
+                if acts[-1].stamp_ns >= failure.since_ns:  # else of another one of this number
+                    found.append(failure)
     return with_acts(store, found)
 
 

@@ -159,8 +159,7 @@ def export(
 
 
 AREAS = Group(
-    "Named areas of a site.",
-    {"import": import_, "list": list_areas, "remove": remove_areas, "export": export},
+    "Named areas of a site.", {"import": import_, "list": list_areas, "remove": remove_areas, "export": export}
 )
 
 

@@ -23,8 +23,7 @@ KeyFile = Annotated[
     ),
 ]
 Hosts = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="Name or address of this machine for robots; repeat it."),
+    list[str] | None, typer.Option(metavar="NAME", help="Name or address of this machine for robots; repeat it.")
 ]
 Rotated = Literal["online", "root", "server", "robots-ca"]
 SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]

@@ -211,11 +211,8 @@ class Console:
         @self.app.get(f"/{path}", include_in_schema=False)
         async def followed(request: Request, site: str) -> StreamingResponse:
             """A stream of server-sent events."""
-            chosen = (
-                site
-                if site in await to_thread(under_way, site)
-                else await to_thread(self.services.maps.chosen_site, site)
-            )
+            is_new = site in await to_thread(under_way, site)
+            chosen = site if is_new else await to_thread(self.services.maps.chosen_site, site)
             context = PageContext(_root(request), chosen, _zone(request), request.query_params)
             guard, ended = self.services.settings.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
 

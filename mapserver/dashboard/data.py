@@ -141,12 +141,11 @@ class MapData:
 
     def plan(self, site: str, version: int) -> Plan:
         """The plan of a version; the last ones are kept, since versions do not change."""
-        return self._plans.get(
-            self.store.version(site, version).manifest_sha256,
-            lambda: make_plan(
-                self.store.manifest(site, version), lambda entry: decode_tile(self.store.blob(entry.sha256))
-            ),
-        )
+
+        def made() -> Plan:
+            return make_plan(self.store.manifest(site, version), lambda tile: decode_tile(self.store.blob(tile.sha256)))
+
+        return self._plans.get(self.store.version(site, version).manifest_sha256, made)
 
     def underlays(self, site: str, version: int, root: str) -> list[Layer]:
         """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""

@@ -20,8 +20,7 @@ from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
 from mapserver.quality.gate import CHECKS
 from mapserver.releases.version_diff import Difference
-from mapserver.store import Event, VerdictRow, VersionInfo
-from mapserver.store.rows import SiteReleases
+from mapserver.store import Event, SiteReleases, VerdictRow, VersionInfo
 
 _EVENTS_SHOWN = 50
 _COURSES_NS = 14 * 86_400_000_000_000

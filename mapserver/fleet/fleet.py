@@ -21,9 +21,8 @@ from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet_statistics.canary_decision import number_of
 from mapserver.fleet_statistics.health_stream import ClockSkew
-from mapserver.store import CanaryRow, MapStore
+from mapserver.store import CanaryRow, MapStore, RobotInfo
 from mapserver.store.files import check_no_link, make_folder
-from mapserver.store.rows import RobotInfo
 
 MAX_ROBOTS = 10_000
 MAX_FAILURE_BYTES = 4 * messages.MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with text
@@ -125,9 +124,7 @@ class Fleet:
     def __init__(
         self, store: MapStore, *, settings: IngestSettings = _USUAL, clock_ns: Callable[[], int] = time.time_ns
     ) -> None:
-        self._store = store
-        self._clock_ns = clock_ns
-        self._lock = threading.Lock()
+        self._store, self._clock_ns, self._lock = store, clock_ns, threading.Lock()
         self._ingest = Ingest(store, settings)
         self.prune = self._ingest.prune
         self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)

@@ -17,9 +17,8 @@ from fleetmap.bus.endpoints import is_loopback
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, StateError, UntrustedError, UsageError, disk_errors
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, VersionState, site_role
-from mapserver.store import MapStore, VersionInfo
+from mapserver.store import MapStore, SiteReleases, VersionInfo
 from mapserver.store.files import make_folder
-from mapserver.store.rows import SiteReleases
 from mapserver.trust.keys import KeyFolder, make_key, make_passphrase
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 

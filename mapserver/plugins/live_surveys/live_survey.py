@@ -132,11 +132,7 @@ class LiveFigures(NamedTuple):
 
 
 def run_live(
-    drive: Drive,
-    tells: Sequence[Tell],
-    is_stopped: Callable[[], bool],
-    console: Console,
-    see: See | None = None,
+    drive: Drive, tells: Sequence[Tell], is_stopped: Callable[[], bool], console: Console, see: See | None = None
 ) -> tuple[LiveFigures, BuiltMap]:
     """Run a survey to its end, or until it is stopped; return the figures of the drive, and the draft built from it.
 
