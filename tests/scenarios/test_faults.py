@@ -13,11 +13,11 @@ from benchmarks.common import estimator_loop
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.map_view import MapView
 from fleetsim.motion import LIFT_S
-from fleetsim.recorder import Order, Session, prepare
+from fleetsim.recorder import Order, Session
 from fleetsim.sensors.measurements import Fault, FaultPlan
 from locclient.localization.estimate import Estimate
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 BEGIN_S = 2.5  # on the way, three seconds before the end
 WRONG_M = 0.3
@@ -26,14 +26,12 @@ WRONG_M = 0.3
 @lru_cache(maxsize=1)
 def _site() -> tuple[Session, LandmarkField, MapView]:
     """A robot's drive along three metres, and the map of another's."""
-    survey = prepare(Order("clip"))
-    survey.renderer.close()
+    survey = unpictured(Order("clip"))
     field = LandmarkField(survey.world)
     surveyed = EstimatorSession(survey, field=field)
     tiles, vocabulary = estimator_loop.survey_map(surveyed, np.random.default_rng(0), every_m=0.2)
-    robot = prepare(Order("clip", robot="tote-1"))
-    robot.renderer.close()
-    return robot, field, estimator_loop.map_view(surveyed, tiles, vocabulary)
+    robot = unpictured(Order("clip", robot="tote-1"))
+    return robot, field, MapView(tiles, vocabulary, surveyed.camera.focal_px)
 
 
 def driven(name: str, duration_s: float) -> tuple[EstimatorSession, list[Estimate]]:
@@ -85,9 +83,7 @@ def test_a_gap_is_bridged_by_the_other_sensor(fault: str, duration_s: float) -> 
 def test_a_robot_that_is_carried_is_lost_when_it_is_lifted() -> None:
     """Within half a second of the first pull, with that cause; on the floor of another place it finds itself. No drive is a lift."""
     _, field, view = _site()
-    carried = prepare(Order("clip", robot="carried", frames=130))
-    carried.renderer.close()
-    session = EstimatorSession(carried, field=field)
+    session = EstimatorSession(unpictured(Order("clip", robot="carried", frames=130)), field=field)
     by_time = said(session, estimator_loop.run_localizer(session, view, has_wheels=True))
     heights_m, times_s = session.map_from_body[:, 2, 3], np.array(list(by_time))
     in_air_s = times_s[heights_m > heights_m[0] + 0.005]
@@ -100,9 +96,7 @@ def test_a_robot_that_is_carried_is_lost_when_it_is_lifted() -> None:
 
 
 def test_a_robot_without_wheels_knows_from_its_drive_what_a_lift_is() -> None:
-    session = prepare(Order("faults", robot="kidnapped"))
-    session.renderer.close()
-    run = EstimatorSession(replace(session, wheel=()))
+    run = EstimatorSession(replace(unpictured(Order("faults", robot="kidnapped")), wheel=()))
     heights_m, stamps_s = run.map_from_body[:, 2, 3], np.array(run.stamps_ns) * 1e-9
     in_air_s = stamps_s[heights_m > heights_m[:30].max() + 0.005]
     told_s = [e.stamp_ns * 1e-9 for e in estimator_loop.run_odometry(run) if e.is_lifted]

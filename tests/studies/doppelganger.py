@@ -87,7 +87,9 @@ def mapped(way: Way, sigma_deg: float, seed: int) -> tuple[Array, int, int, int]
             possible = [one for one in loops if one[0].i == k and marginals.innovation_squared(one[0]) <= CHI2_6_0999]
             steps = _BESIDE_M if way == "gate and step" else _BESIDE_M[:0]
             unseen = [marginals.innovations_squared_beside(one[0], steps) for one in possible]
-            if len(_places(possible, truth)) == 1 and not (np.array(unseen) <= CHI2_6_0999).any():
+            # More than one place for the other end is an ambiguous view, of which nothing is learned.
+            places = {tuple(truth[edge.j, :2, 3].round(1)) for edge, _ in possible}
+            if len(places) == 1 and not (np.array(unseen) <= CHI2_6_0999).any():
                 for one in possible:
                     marginals.add(one[0])
                 inside += possible
@@ -97,11 +99,6 @@ def mapped(way: Way, sigma_deg: float, seed: int) -> tuple[Array, int, int, int]
     found = optimize_pose_graph(start, [*edges, *(edge for edge, _ in chosen)], robust=way != "appearance")
     believed = [is_same for (_, is_same), weight in zip(chosen, found.loop_weights, strict=True) if weight > 0.5]
     return found.map_from_body, believed.count(False), believed.count(True), sum(is_same for _, is_same in loops)
-
-
-def _places(loops: list[tuple[PoseEdge, bool]], truth: Array) -> set[tuple[float, ...]]:
-    """Where the other ends stand: more than one place is an ambiguous view, of which nothing is learned."""
-    return {tuple(truth[edge.j, :2, 3].round(1)) for edge, _ in loops}
 
 
 def case(way: Way, sigma_deg: float) -> Row:

@@ -61,15 +61,11 @@ def tour(layout: Layout, aisles: tuple[int, int, int] = (0, 3, 4)) -> Route:
     return Route(((left, y[0]), (right, y[0]), (right, y[1]), (left, y[1]), (left, y[2]), (right, y[2])))
 
 
-def aisles_of(night: int) -> tuple[int, int]:
-    """What the survey robot of a night drives; an aisle is closed for four nights."""
-    return (3, 4) if night in CLOSED and night % 3 == 1 else THIRDS[night % 3]
-
-
 def scenario(night: int, aisles: tuple[int, int, int] = (0, 3, 4)) -> Scenario:
     """The site on the day after a night, with the survey of that night and the robot of the day, in these aisles."""
     layout = BEFORE if night < MOVED else AFTER
-    route = snake(layout) if night == 0 else loop(layout, *aisles_of(night))
+    surveyed = (3, 4) if night in CLOSED and night % 3 == 1 else THIRDS[night % 3]  # an aisle is closed for four nights
+    route = snake(layout) if night == 0 else loop(layout, *surveyed)
     dark = (Fault("camera-dark", 4.0, 1e6),) if night == DARK else ()
     survey = Run("surveyor", (route,), rate_hz=7.5, is_sharp=True, faults=dark)
     return Scenario(

@@ -16,13 +16,15 @@ from scipy.stats import chi2
 from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, se3_log, so3_exp, transform_points
 from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.problem import BundleProblem
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from mapserver.survey.settings import BundleSettings
+from mapserver.survey.settings import BundleSettings, SurveySettings
 from support.problems.g2o import parse_g2o
 from support.recordings.realdata import DATA
 from support.worlds.bundle_gtsam import gtsam_graph
-from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, disturbed
+from support.worlds.bundle_scene import disturbed
+from support.worlds.corridor_scene import scene
 
 Figures = dict[str, float]
 T = TypeVar("T")
@@ -104,37 +106,12 @@ def _with_wrong_loops(map_from_body: Array, edges: list[PoseEdge], clean: Array)
 
 
 def corridor(keyframes: int, landmarks: int, observations: int, fixed: int) -> BundleProblem:
-    """A drive along two walls with noisy sightings: every landmark from its nearest keyframes that see it."""
-    rng = np.random.default_rng(2)
-    length_m = 0.3 * keyframes
-    body_from_cam = BODY_FROM_CAM
-    map_from_body = np.array(
-        [se3(so3_exp(np.array([0, 0, 0.02 * np.sin(k)])), [0.3 * k, 0, 0]) for k in range(keyframes)]
-    )
-    side = rng.choice([-1.0, 1.0], landmarks)
-    points = np.column_stack(
-        [rng.uniform(2.0, length_m + 4.0, landmarks), 2.0 * side, rng.uniform(-1.5, 1.5, landmarks)]
-    )
-    rows = []
-    for k, placed in enumerate(map_from_body):
-        near = np.flatnonzero(np.abs(points[:, 0] - 0.3 * k - 5.0) < 6.0)
-        seen = transform_points(se3_inverse(placed @ body_from_cam), points[near])
-        pixels = CAMERA.pixel_from_point(seen)
-        good = (seen[:, 2] > 0.8) & (pixels[:, :2] > 0).all(axis=1) & (pixels[:, 0] < 640) & (pixels[:, 1] < 480)
-        rows.append(np.column_stack([np.full(good.sum(), k), near[good], pixels[good], seen[good, 2]]))
-    table = np.concatenate(rows)
-    table = table[np.argsort(rng.random(len(table)), kind="stable")]
-    share = observations / len(table)
-    table = table[: int(len(table) * min(share, 1.0))]
-    counts = np.bincount(table[:, 1].astype(int), minlength=landmarks)
-    table = table[counts[table[:, 1].astype(int)] >= 2]
-    pixels = table[:, 2:5] + 0.4 * rng.normal(size=(len(table), 3))
-    held = np.zeros(keyframes, np.bool_)
-    held[:fixed] = True
-    return BundleProblem(
-        CAMERA, body_from_cam, map_from_body, held, points, table[:, 0].astype(np.int32), table[:, 1].astype(np.int32),
-        pixels, np.tile([0.4, 0.5], (len(table), 1)),
-    )  # fmt: skip
+    """A drive along two walls with noisy sightings, so many of them, at random."""
+    problem = bundle_problem(scene(keyframes, 2, drift=0.0, landmarks=landmarks).state, SurveySettings(), None)
+    chosen = np.random.default_rng(2).permutation(len(problem.obs_landmark))[:observations]
+    problem = problem.observed(np.sort(chosen))
+    problem.fixed[:fixed] = True
+    return problem
 
 
 def _held_by_priors(problem: BundleProblem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

@@ -11,12 +11,12 @@ from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion import Route, RouteMotion
-from fleetsim.recorder import Order, Session, prepare
+from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.sensors.measurements import START_NS, Fault, FaultPlan, measure_imu, measure_wheels, sample_times
 from fleetsim.sensors.robots import nominal_calibration, true_calibration
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 _SCENARIO = "small-loop"
 _SIDEWAYS_M = 0.15  # by which a run's way points are shifted at random
@@ -41,8 +41,7 @@ class Site:
     """One simulated site whose world and landmarks all runs share; the drives, noises, biases and slips are each run's own."""
 
     def __init__(self) -> None:
-        self._base = prepare(Order(_SCENARIO))
-        self._base.renderer.close()
+        self._base = unpictured(Order(_SCENARIO))
         self._field = LandmarkField(self._base.world)
         self._robots = list(SCENARIOS[_SCENARIO]().runs)
 

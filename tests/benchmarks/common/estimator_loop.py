@@ -315,11 +315,6 @@ def run_localizer(
     return estimates
 
 
-def map_view(session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabulary) -> MapView:
-    """What a robot with the session's camera holds of a map that was surveyed with the same."""
-    return MapView(tiles, vocabulary, session.camera.focal_px)
-
-
 def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array) -> Array:
     """(N,) errors of the motion over 15 frames, of estimates that know gravity."""
     step = 15
@@ -330,11 +325,3 @@ def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array) -
         truly = se3_inverse(map_from_body[k]) @ map_from_body[k + step]
         errors.append(float(np.linalg.norm(moved[:3, 3] - truly[:3, 3])))
     return np.array(errors)
-
-
-def position_errors_m(estimates: list[Estimate], map_from_body: Array) -> Array:
-    """(N,) distances from the truth of the estimates that are there."""
-    pairs = zip(estimates, map_from_body, strict=False)
-    return np.array(
-        [np.linalg.norm(e.map_from_body[:3, 3] - truth[:3, 3]) for e, truth in pairs if e.map_from_body is not None]
-    )

@@ -98,15 +98,11 @@ def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[RecordingSurvey]
     ).rmse_m
 
 
-def path_m(survey: RecordingSurvey) -> float:
-    """Of the survey's frames."""
-    return float(np.linalg.norm(np.diff(survey.survey.map.trajectory.positions_m, axis=0), axis=1).sum())
-
-
 def added(base: SurveyMap | None, surveys: Sequence[RecordingSurvey]) -> MergedMap:
     """The map with these sessions; RuntimeError if one is not joined."""
     settings = survey_settings(None, surveys[0].sensor_set)
-    if path_m(surveys[0]) < _SHORT_M:  # whether such halves belong together is no question here
+    way_m = np.diff(surveys[0].survey.map.trajectory.positions_m, axis=0)
+    if np.linalg.norm(way_m, axis=1).sum() < _SHORT_M:  # whether such halves belong together is no question here
         settings = msgspec.structs.replace(settings, sessions=msgspec.structs.replace(settings.sessions, min_places=1))
     joining = MapMerger(base, settings, SurveyLimits())
     for each in surveys:

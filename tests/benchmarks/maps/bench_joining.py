@@ -13,7 +13,7 @@ pose graph of fixes.
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from benchmarks.common.joining_sites import Drive, Site, SiteMap, cut, drive, error_m, length_m, session, site_map
 from benchmarks.common.recorded_runs import Options, Results, benchmark
@@ -29,9 +29,8 @@ PARTS = "foreign", "true"
 
 def rate(count: int, total: int) -> dict[str, Any]:
     """A share with its bounds of 95 %."""
-    low = float(beta.ppf(0.025, count, total - count + 1)) if count else 0.0
-    high = float(beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0
-    return {"count": count, "of": total, "share": count / max(total, 1), "low": low, "high": high}
+    low, high = binomtest(count, total).proportion_ci() if total else (0.0, 1.0)
+    return {"count": count, "of": total, "share": count / max(total, 1), "low": float(low), "high": float(high)}
 
 
 def decided(here: SiteMap, moved: Drive, docks: Array | None) -> dict[str, Any]:

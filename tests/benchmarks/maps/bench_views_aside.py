@@ -26,12 +26,13 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.motion import check_clear
-from fleetsim.recorder import Order, prepare
+from fleetsim.recorder import Order
 from fleetsim.renderer import RigRenderer
 from mapserver.quality.probes import Probe, probe_features, relocalized
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from mapserver.survey.survey_map import SurveyMap
+from support.estimator.simulated_run import unpictured
 from support.recordings.realdata import DATA
 
 ASIDE_M, ASIDE_RAD = 0.5, np.radians(10.0)
@@ -63,8 +64,7 @@ def aside(map_from_body: Array) -> Array:
 
 def rendered(scenario: str, seed: int | None, survey: SurveyMap) -> Iterator[tuple[int, Probe]]:
     """(Keyframe, what is seen aside of it), the drive's last one first, without places inside of racks."""
-    session = prepare(Order(scenario, seed=seed or 0, robot="survey"))
-    session.renderer.close()
+    session = unpictured(Order(scenario, seed=seed or 0, robot="survey"))
     numbers, places = [], []
     for k in range(len(survey.map_from_body) - 1, -1, -1):
         for place in aside(survey.map_from_body[k]):

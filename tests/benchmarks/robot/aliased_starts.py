@@ -15,7 +15,7 @@ from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior, Trajectory
-from fleetsim.recorder import Order, Session, prepare
+from fleetsim.recorder import Order, Session
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 from mapserver.drafting.draft_evidence import PROBES
@@ -24,7 +24,7 @@ from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import choose_landmarks
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting, Smudge
+from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting, Smudge, unpictured
 
 RIGHT_M, WRONG_M = 0.5, 0.3
 WHOLE_SITE = LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True))
@@ -73,16 +73,14 @@ class Site:
 
 def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways", day: int = 0) -> Site:
     """The site of that seed, surveyed through every aisle both ways by default; the robot drives a day later, on day 0 the same day."""
-    session = prepare(Order(scenario, seed=seed, robot=survey_run, day=day))
-    session.renderer.close()
+    session = unpictured(Order(scenario, seed=seed, robot=survey_run, day=day))
     field = LandmarkField(session.world)
     survey = EstimatorSession(session, field=field)
-    drive = prepare(Order(scenario, seed=seed, robot="runner-1", day=day + 1 if day else 0))
-    drive.renderer.close()
+    drive = unpictured(Order(scenario, seed=seed, robot="runner-1", day=day + 1 if day else 0))
     robot = RememberingSession(drive, LandmarkField(drive.world) if day else field)
     (whole_tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=_EVERY_M)
     tile = within_budget(whole_tile, survey.camera, survey.body_from_cam)
-    view = estimator_loop.map_view(robot, [tile], vocabulary)
+    view = MapView([tile], vocabulary, robot.camera.focal_px)
     return Site(robot, tile, view, None if survey_run == "survey-both-ways" else measured_lookalikes(view, survey))
 
 
@@ -251,7 +249,7 @@ def with_aisles(site: Site, aisles: tuple[int, ...]) -> Site:
         return np.asarray((np.abs(ys_m[:, None] - centres) < layout.pitch_m / 2).any(axis=1))
 
     part = part_of(site.tile, near(site.tile.points_map[:, 1]), near(site.tile.map_from_cam[:, 1, 3]))
-    return Site(site.robot, part, estimator_loop.map_view(site.robot, [part], site.view.vocabulary))
+    return Site(site.robot, part, MapView([part], site.view.vocabulary, site.robot.camera.focal_px))
 
 
 def summary(found: Iterable[Start], within_s: float) -> dict[str, float]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +25,15 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.replay_source import ReplaySource
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, Session, prepare
-from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.recorder import Order, Session
+from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors.measurements import Fault
 from locclient.localization.estimate import Estimate
 from locclient.replay import run_metrics
 from studies.robot_days.drives import judged
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 LAYOUT = Layout(aisles=4, bays=8, are_aisles_identical=True)
 _NAME, _END_M, _BEGIN_S, _AFTER_S = "lost", 2.7, 8.0, 12.0
@@ -70,10 +69,7 @@ def _route(rng: np.random.Generator, length_m: float) -> Route:
 
 
 def _prepared(seed: int, day: int, name: str, run: Run) -> Session:
-    with patch.dict(SCENARIOS, {_NAME: lambda: Scenario("robots that lose their place", LAYOUT, {name: run})}):
-        session = prepare(Order(_NAME, seed=seed, day=day))
-    session.renderer.close()
-    return session
+    return unpictured(Order(_NAME, seed, day), Scenario("robots that lose their place", LAYOUT, {name: run}))
 
 
 @lru_cache(maxsize=1)
@@ -89,7 +85,7 @@ def _map(seed: int) -> tuple[MapView, LandmarkField]:
     )
     (tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=0.8)
     tile = within_budget(tile, survey.camera, survey.body_from_cam)
-    return estimator_loop.map_view(survey, [tile], vocabulary), LandmarkField(
+    return MapView([tile], vocabulary, survey.camera.focal_px), LandmarkField(
         _prepared(seed, 1, "robot", Run("runner", (_route(np.random.default_rng(0), 1.0),))).world
     )
 

@@ -7,13 +7,14 @@ metres off, in a direction of its own, in the identical aisles and in the same o
 seconds.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.common import estimator_loop
 from benchmarks.common.recorded_runs import Options, Results, benchmark
-from benchmarks.robot.aliased_starts import LateSession, Site, is_wrong, surveyed_site
+from benchmarks.robot.aliased_starts import LateSession, Site, judged, surveyed_site
+from benchmarks.robot.aliased_starts import Start as Outcome
 from fleetmap.geometry import Array, se3
 from fleetmap.messages import Placement, Status
 from fleetmap.plugins.markers import Marker, MarkerList
@@ -44,7 +45,6 @@ class Start:
     rng: np.random.Generator
     named: str = ""
     is_known: bool = False
-    estimates: list[Estimate] = field(default_factory=list)
 
     def priors(self, frame: int) -> list[PositionPrior]:
         """What the plug-in tells by the painted picture of a frame."""
@@ -59,20 +59,11 @@ class Start:
         self.is_known = estimate.status is Status.TRACKING
         return False
 
-    @property
-    def tracking_s(self) -> float | None:
-        """Seconds until TRACKING at the right place."""
-        pairs = zip(self.estimates, self.session.map_from_body, strict=False)
-        right = [e.stamp_ns for e, truth in pairs if e.status is Status.TRACKING and not is_wrong(e, truth)]
-        return (right[0] - self.session.stamps_ns[0]) * 1e-9 if right else None
 
-    @property
-    def wrong_frames(self) -> int:
-        return sum(is_wrong(e, truth) for e, truth in zip(self.estimates, self.session.map_from_body, strict=False))
-
-
-def start_at(site: Site, number: int, moved_m: float, duration_s: float, rng: np.random.Generator) -> Start:
-    """The start at a frame of the drive."""
+def start_at(
+    site: Site, number: int, moved_m: float, duration_s: float, rng: np.random.Generator
+) -> tuple[str, Outcome]:
+    """What names the marker, and the outcome of the start at a frame of the drive."""
     session = LateSession(site.robot, number)
     map_from_cam = session.map_from_body[0] @ session.body_from_cam
     ahead_m, bearing_rad = rng.uniform(0.8, 2.2), rng.uniform(-0.35, 0.35)
@@ -87,10 +78,10 @@ def start_at(site: Site, number: int, moved_m: float, duration_s: float, rng: np
     source = MarkerPriors(MarkerList(markers=(marker,)), mounted, session.session.nominal.base_from_body)
     start = Start(session, there, source, rng)
     count = int(np.searchsorted(session.stamps_ns, session.stamps_ns[0] + int(duration_s * 1e9)))
-    start.estimates = estimator_loop.run_localizer(
+    estimates = estimator_loop.run_localizer(
         session, site.view, None, count, lookalikes=site.lookalikes, priors=start.priors, until=start.judge
     )
-    return start
+    return start.named, judged(number, session, estimates)
 
 
 def in_aisles(site: Site, count: int) -> list[int]:
@@ -109,13 +100,13 @@ def main(arguments: Options) -> Results:
             sites[scenario] = surveyed_site(scenario, arguments.seed)
         site, rng = sites[scenario], np.random.default_rng([arguments.seed, 2])
         found = [start_at(site, number, moved_m, duration_s, rng) for number in in_aisles(site, arguments.starts)]
-        times_s = [start.tracking_s for start in found]
+        times_s = [start.tracking_s for _, start in found]
         figures[name] = {
             "starts": len(found),
-            "wrong_starts": sum(start.wrong_frames > 0 for start in found),
+            "wrong_starts": sum(start.wrong_frames > 0 for _, start in found),
             "in_time": sum(time_s is not None and time_s <= IN_TIME_S for time_s in times_s),
             "tracking": sum(time_s is not None for time_s in times_s),
-            "named": sum(bool(start.named) for start in found),
+            "named": sum(bool(named) for named, _ in found),
             "last_s": max((time_s for time_s in times_s if time_s is not None), default=None),
         }
     return {"figures": figures}

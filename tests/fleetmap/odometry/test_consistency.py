@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import consistency, estimator_loop
-from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inverse
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
@@ -50,14 +50,9 @@ def test_a_standing_robot_stays_and_does_not_become_too_sure(site: consistency.S
     assert max(np.linalg.norm(e.velocity_odom_mps) for e in estimates[first:]) < 0.01
     sigma_m = np.sqrt(np.trace(estimates[-1].cov_rot_trans[3:, 3:]))
     assert np.linalg.norm(places[-1] - places[0]) < 3 * sigma_m
-    turned = se3_angle(estimates[first], estimates[-1])
+    turned = rotation_angle_rad(estimates[first].odom_from_body[:3, :3].T @ estimates[-1].odom_from_body[:3, :3])
     assert turned < 3 * np.sqrt(np.trace(estimates[-1].cov_rot_trans[:3, :3]))
     assert turned < 2e-3
-
-
-def se3_angle(a: OdometryEstimate, b: OdometryEstimate) -> float:
-    turn = a.odom_from_body[:3, :3].T @ b.odom_from_body[:3, :3]
-    return float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))
 
 
 def test_slipping_wheels_are_refused_and_others_help(site: consistency.Site) -> None:

@@ -54,7 +54,8 @@ def test_it_comes_out_on_the_right_floor(monkeypatch: pytest.MonkeyPatch, how: d
 def test_forty_rides(monkeypatch: pytest.MonkeyPatch, how: dict[str, Any]) -> None:
     """Seeds that nothing was developed with."""
     results = rides(monkeypatch, range(1000, 1040), **how)
-    assert sum(result.is_in_time for result in results) >= 38
+    found = [result for result in results if result.found_s is not None and result.found_m is not None]
+    assert sum(result.found_s <= 5.0 or result.found_m <= 3.0 for result in found) >= 38
 
 
 def test_without_an_accelerometer_equal_floors_stay_both(monkeypatch: pytest.MonkeyPatch) -> None:

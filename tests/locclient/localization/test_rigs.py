@@ -49,7 +49,8 @@ def views(
 def east_bound_map() -> MapView:
     """What a survey with one pair saw on its way east."""
     survey, _ = views("surveyor", ((WEST_M, Y_M), (EAST_M, Y_M)), (0.0, 0.0))
-    return estimator_loop.map_view(survey, *estimator_loop.survey_map(survey, np.random.default_rng(0), every_m=0.6))
+    tiles, vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(0), every_m=0.6)
+    return MapView(tiles, vocabulary, survey.camera.focal_px)
 
 
 def driven(

@@ -23,7 +23,7 @@ from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 from support.recordings.painted_room import standing_first, write_ride
-from support.recordings.spoiled_recording import changed
+from support.recordings.spoiled_recording import changed, without_imu
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
 Change = Callable[[Recording], Recording]
@@ -81,11 +81,6 @@ def wheels(speed: float = 1.0, yaw: float = 1.0) -> Change:
 
 def without_wheels(recording: Recording) -> Recording:
     return replace(recording, wheel=())
-
-
-def without_imu(recording: Recording) -> Recording:
-    rig = replace(recording.calibration, imu=None)
-    return replace(recording, imu=ImuSamples.empty(), calibration=rig, sensor_set=SensorSet.STEREO)
 
 
 def longer(times: float, *before: Change) -> Change:

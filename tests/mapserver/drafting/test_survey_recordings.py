@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -53,7 +54,9 @@ def test_frames_are_decoded_once(
     decode = series.decode_frame
     monkeypatch.setattr(series, "decode_frame", lambda stored: (found.append(stored.stamp_ns), decode(stored))[1])
     if not has_room:
-        monkeypatch.setattr(mapped_images.os, "posix_fallocate", full)
+        monkeypatch.setattr(
+            mapped_images.os, "posix_fallocate", Mock(side_effect=OSError(28, "No space left on device"))
+        )
     with open_recording(drive) as plain:
         expected = [plain.read_frame(n) for n in range(8)]
     with OpenRecordings(RecordingOptions(), tmp_path) as reading:
@@ -68,10 +71,6 @@ def test_frames_are_decoded_once(
         np.testing.assert_array_equal(own.right, theirs.right)
     assert len(found) == decodings
     assert list(tmp_path.iterdir()) == []
-
-
-def full(*_: object) -> None:
-    raise OSError(28, "No space left on device")
 
 
 def test_another_recording_closes_the_one_before(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

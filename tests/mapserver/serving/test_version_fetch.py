@@ -9,6 +9,7 @@ import pytest
 
 from fleetmap.errors import UnreachableError
 from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import PART_BYTES
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
@@ -82,7 +83,8 @@ def test_a_night_costs_what_changed(world: World) -> None:
     world.hall.ready()
     whole = world.hall.chunks.received_bytes
     assert whole > 900_000
-    tiles = world.current_tiles()
+    entries = world.store.manifest("hall", world.store.current("hall").version).tiles
+    tiles = [decode_tile(world.store.blob(entry.sha256)) for entry in entries]
     world.publish(tiles)  # nothing moved
     world.hall.ready()
     unmoved = world.hall.chunks.received_bytes - whole

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import lru_cache
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,13 +16,13 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.time_sliced import finished
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, prepare
+from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS
 from mapserver.config import survey_settings
 from mapserver.survey.stages import Survey
 from mapserver.tiles.tiling import tiles_from_survey
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 _ALONG = "along"  # one way
@@ -36,9 +35,7 @@ def driven(name: str, day: int = 0, rig: str = "front-rear") -> list[EstimatorSe
     y = base.layout.aisle_y_m(0)
     way = ((4.5, y - 0.4), (8.5, y - 0.4)) + (((8.5, y + 0.4), (4.5, y + 0.4)) if name == _BACK else ())
     runs = {name: replace(base.runs["survey"], routes=(Route(way, rest_s=0.5),), rate_hz=5.0)}
-    with patch.dict(SCENARIOS, clip=lambda: replace(base, runs=runs)):
-        session = prepare(Order("clip", seed=4, day=day, robot=name, rig=rig))
-    session.renderer.close()
+    session = unpictured(Order("clip", seed=4, day=day, robot=name, rig=rig), replace(base, runs=runs))
     field = LandmarkField(session.world)
     return [EstimatorSession(session, field=field, view=view) for view in range(len(session.nominal.views))]
 

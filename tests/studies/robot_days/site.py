@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from unittest.mock import patch
 
 import numpy as np
 
@@ -10,14 +9,14 @@ from benchmarks.common import estimator_loop
 from benchmarks.robot.aliased_starts import RememberingSession, within_budget
 from fleetmap.relocalization.map_view import MapView
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, Session, prepare
-from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.recorder import Order, Session
+from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover
 from fleetsim.scene.world import World
 from fleetsim.sensors.measurements import Fault
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession, Smudge
+from support.estimator.simulated_run import EstimatorSession, Smudge, unpictured
 
 # Aisles, bays and cross aisles of the scenario fulfilment-centre, six of its sixty aisles, without its packing area.
 LAYOUT = Layout(aisles=6, bays=33, aisle_width_m=2.3, cross_bays=(11, 22), are_aisles_identical=True)
@@ -99,10 +98,7 @@ def random_route(rng: np.random.Generator, length_m: float, stop_s: float = 0.0)
 def prepared(seed: int, day: int, name: str, run: Run, movers: tuple[Mover, ...] = ()) -> Session:
     """A run ready but for pictures, of which there are none; motion's ripple and the sensors' errors follow from the name."""
     scenario = Scenario("a block of the fulfilment centre", LAYOUT, {name: run}, movers)
-    with patch.dict(SCENARIOS, {NAME: lambda: scenario}):
-        session = prepare(Order(NAME, seed=seed, day=day))
-    session.renderer.close()
-    return session
+    return unpictured(Order(NAME, seed=seed, day=day), scenario)
 
 
 @lru_cache(maxsize=3)

@@ -92,13 +92,14 @@ class LandmarkField:
         found: list[Landmarks] = []
         for key in keys:
             chunk = self.chunk(*key)
-            gap_m = _gap(self._bounds[key], centre)
+            low, high = self._bounds[key][:3], self._bounds[key][3:]
+            gap_m = np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0))
             reaching = np.flatnonzero(CELLS_M * _LARGEST * reach_per_m > gap_m)
             if not len(chunk) or not len(reaching):
                 continue
             first, columns = int(chunk.firsts[reaching[0]]), (chunk.points_map, chunk.normals_map, chunk.sizes_m)
             found.append(chunk.take(visible_from(first, *columns, view, grid)))
-        return _joined(found)
+        return joined(found)
 
     def _boxes_around(self, centre: Array) -> tuple[list[tuple[int, int]], BoxGrid]:
         """The chunks around the chunk that holds a place, and a grid of their boxes."""
@@ -121,23 +122,15 @@ class LandmarkField:
         return self._grids[middle]
 
 
-def _joined(parts: list[Landmarks]) -> Landmarks:
+def joined(parts: list[Landmarks]) -> Landmarks:
     """All of them by rising id."""
     if not parts:
         return Landmarks(
             np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.uint64), np.zeros(1, np.int64)
         )
-    points, normals, sizes, keys = (
-        np.concatenate([getattr(part, column) for part in parts])
-        for column in ("points_map", "normals_map", "sizes_m", "keys")
-    )
-    order = np.argsort(keys[:, 2], kind="stable")
-    return Landmarks(points[order], normals[order], sizes[order], keys[order], np.zeros(1, np.int64))
-
-
-def _gap(bounds_m: Array, place: Array) -> float:
-    """Distance from a place to a bounding box."""
-    return float(np.linalg.norm(np.maximum(np.maximum(bounds_m[:3] - place, place - bounds_m[3:]), 0.0)))
+    columns = ("points_map", "normals_map", "sizes_m", "keys")
+    whole = Landmarks(*(np.concatenate([getattr(p, name) for p in parts]) for name in columns), np.zeros(1, np.int64))
+    return whole.take(np.argsort(whole.keys[:, 2], kind="stable"))
 
 
 def _texture_weights(world: World) -> Array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetsim.scene.movers import MOVER_KINDS, Mover
-from support.estimator.landmarks import Landmarks
+from support.estimator.landmarks import Landmarks, joined
 
 _CELL_M, _SMALLEST_COSINE = 0.08, 0.15
 _CORNER_SHARE = 0.5  # of the cells of clothes and paint; an assumption
@@ -42,18 +42,14 @@ class MoverLandmarks:
         boxes = self.boxes(time_s, centre_map)
         if not boxes:
             return landmarks
-        parts = [landmarks, *(_on_box(*box, centre_map) for box in boxes)]
-        columns = ("points_map", "normals_map", "sizes_m", "keys")
-        points, normals, sizes, keys = (np.concatenate([getattr(p, column) for p in parts]) for column in columns)
-        seen = np.ones(len(points), bool)
-        away = points - centre_map
+        marks = joined([landmarks, *(_on_box(*box, centre_map) for box in boxes)])
+        seen = np.ones(len(marks), bool)
+        away = marks.points_map - centre_map
         far = np.linalg.norm(away, axis=1)
         for _, _, centre, half, rotation in boxes:
             rows = np.flatnonzero(_may_be_behind(away, far, centre - centre_map, half))
-            seen[rows] &= ~_is_behind(points[rows], centre_map, centre, half - _SKIN_M, rotation)
-        rows = np.flatnonzero(seen)
-        rows = rows[np.argsort(keys[rows, 2], kind="stable")]
-        return Landmarks(points[rows], normals[rows], sizes[rows], keys[rows], np.zeros(1, np.int64))
+            seen[rows] &= ~_is_behind(marks.points_map[rows], centre_map, centre, half - _SKIN_M, rotation)
+        return marks.take(np.flatnonzero(seen))
 
 
 def _may_be_behind(away: Array, far_m: Array, toward: Array, half: Array) -> NDArray[np.bool_]:
@@ -99,7 +95,7 @@ def _corners(
 def _on_box(number: int, part: int, centre: Array, half: Array, rotation: Array, eye: Array) -> Landmarks:
     """Its corners that face the eye."""
     points, normals, sizes, keys = _corners(number, part, tuple(half.tolist()))
-    placed, turned = points @ rotation.T + centre, normals @ rotation.T
-    away = eye - placed
-    facing = np.einsum("ni,ni->n", away, turned) > _SMALLEST_COSINE * np.linalg.norm(away, axis=1)
-    return Landmarks(placed[facing], turned[facing], sizes[facing], keys[facing], np.zeros(1, np.int64))
+    placed = Landmarks(points @ rotation.T + centre, normals @ rotation.T, sizes, keys, np.zeros(1, np.int64))
+    away = eye - placed.points_map
+    facing = np.einsum("ni,ni->n", away, placed.normals_map) > _SMALLEST_COSINE * np.linalg.norm(away, axis=1)
+    return placed.take(np.flatnonzero(facing))

@@ -8,7 +8,7 @@ from support.estimator.hashing import Words, mixed, normal, uniform
 from support.estimator.statistics import FeatureStatistics, FlowStatistics
 
 _BORDER_PX = 19.0  # without clutter
-_MASK = (1 << 64) - 1
+_POWERS = np.cumprod([1.0] + [1.2] * 7)  # of the octaves; a library function's last bit varies
 Features = tuple[NDArray[np.int64], Array, NDArray[np.int8], Words]
 """Rows (N,) of landmarks, pixels (N, 3), the third NaN where the disparity is unknown, octaves (N,), descriptors (N, 4)."""
 
@@ -92,15 +92,6 @@ def detect(
     return rows, pixels, octaves.astype(np.int8), words
 
 
-def _powers() -> Array:
-    """1.2 to the power of 0 to 7, by squares."""
-    square, fourth = 1.2 * 1.2, (1.2 * 1.2) * (1.2 * 1.2)
-    return np.array([1.0, 1.2, square, 1.2 * square, fourth, 1.2 * fourth, square * fourth, 1.2 * square * fourth])
-
-
-_POWERS = _powers()
-
-
 def _change_bits(words: Words, keys: Words, counts: NDArray[np.int64]) -> None:
     """Flip a number of bits of descriptors (N, 4) at places that follow from keys (N,) (some may coincide and cancel)."""
     states = [keys]
@@ -117,23 +108,15 @@ def _change_bits(words: Words, keys: Words, counts: NDArray[np.int64]) -> None:
 
 def clutter(first: int, total: int, key: int, size_px: tuple[float, float], known_share: float) -> Features:
     """Features `first` to `total` of a picture that no other will show again, spread over it and the octaves as a detector spreads them."""
-    states = []
-    for n in range(first, total):  # mixed, of numbers that follow each other
-        key = (key + n + 0x9E3779B97F4A7C15) & _MASK
-        key = ((key ^ (key >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-        key = ((key ^ (key >> 27)) * 0x94D049BB133111EB) & _MASK
-        key ^= key >> 31
-        states.append(key)
-    state = np.array(states, np.uint64)
+    numbers = np.arange(first, total)
+    state = mixed(np.full(len(numbers), key, np.uint64), numbers)
     u, v = (_BORDER_PX + uniform(mixed(state, 1 + axis)) * (size_px[axis] - 2 * _BORDER_PX) for axis in range(2))
     depth_draw = uniform(mixed(state, 3))
     is_known = uniform(mixed(state, 4)) < known_share
     pixels = np.stack([u, v, np.where(is_known, u - (3.0 + 30.0 * depth_draw * depth_draw), np.nan)], axis=1)
     draw, octaves = uniform(mixed(state, 5)), np.zeros(len(state), np.int8)
-    left, goes_on = (
-        0.217,
-        np.ones(len(state), bool),
-    )  # share of octave 0 of eight with a factor of 1.2 from one to the next
+    # share of octave 0 of eight with a factor of 1.2 from one to the next
+    left, goes_on = 0.217, np.ones(len(state), bool)
     for _ in range(7):
         goes_on &= draw >= left
         draw = np.where(goes_on, draw - left, draw)

@@ -7,6 +7,7 @@ effect here, over-exposure hides everything, and a smudge hides what lies behind
 
 from dataclasses import dataclass
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier, StereoCamera
-from fleetsim.recorder import Session
+from fleetsim.recorder import Order, Session, prepare
+from fleetsim.scenarios import SCENARIOS, Scenario
 from support.estimator.landmark_lattice import project
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.mover_landmarks import MoverLandmarks
@@ -30,6 +32,14 @@ _DEPTH_DISPARITY_PX = 0.08 * RGBD_BASELINE_M / 0.05  # of fleetsim's depth camer
 _FINEST_OCTAVES = 4.0  # what the flow's corners are found on
 
 Ids = NDArray[np.uint64]
+
+
+def unpictured(order: Order, scenario: Scenario | None = None) -> Session:
+    """A session ready but for pictures, of which there are none; scenario: in the place of the one that the order names."""
+    with patch.dict(SCENARIOS, {} if scenario is None else {order.scenario: lambda: scenario}):
+        session = prepare(order)
+    session.renderer.close()
+    return session
 
 
 class Smudge(NamedTuple):

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -193,20 +193,9 @@ def speak(bus: Bus, robot: str, stamp_ns: int, place_m: tuple[float, float], sta
     bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
 
 
-def speak_all(bus: Bus, count: int, stamp_ns: int, moved: Mapping[str, tuple[float, float]]) -> None:
-    """`count` robots, most of them well; those that moved are lost where they went."""
-    for number in range(count):
-        robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
-        place_m = moved.get(robot)
-        if place_m is None:
-            speak(bus, robot, stamp_ns, place_of(number), status)
-        else:
-            speak(bus, robot, stamp_ns, place_m, "LOST")
-
-
 @contextmanager
 def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]]]:
-    """Robots that report every second, as real ones do; entries of the dictionary move them."""
+    """Robots that report every second, most of them well; entries of the dictionary move them, and they are lost there."""
     moved: dict[str, tuple[float, float]] = {}
     ended = threading.Event()
     with Bus(endpoint).open() as bus:
@@ -214,7 +203,10 @@ def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]
         def talk() -> None:
             stamp_ns = time.time_ns()
             while not ended.is_set():
-                speak_all(bus, count, stamp_ns, dict(moved))
+                for number in range(count):
+                    robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
+                    there = moved.get(robot)
+                    speak(bus, robot, stamp_ns, there or place_of(number), "LOST" if there else status)
                 stamp_ns += 1_000_000_000
                 ended.wait(1.0)
 
@@ -282,18 +274,18 @@ class Seen:
         return {urlsplit(address).netloc for address in self.requests if not address.startswith(("data:", "blob:"))}
 
 
-def is_fault(kind: str, text: str) -> bool:
-    """True for an unexpected console message of a page; performance warnings of software graphics are expected."""
-    return kind in {"error", "warning"} and "GL Driver Message (OpenGL, Performance" not in text
-
-
 @lru_cache(maxsize=4)
 def watch(page) -> Seen:  # type: ignore[no-untyped-def]
     """A page's requests, console errors and error responses since this was first asked."""
     seen = Seen()
+
+    def hear(said) -> None:  # type: ignore[no-untyped-def]
+        if said.type in {"error", "warning"} and "GL Driver Message (OpenGL, Performance" not in said.text:
+            seen.faults.append(said.text)
+
     page.on("request", lambda request: seen.requests.append(request.url))
     page.on("websocket", lambda socket: seen.requests.append(socket.url))
-    page.on("console", lambda said: seen.faults.append(said.text) if is_fault(said.type, said.text) else None)
+    page.on("console", hear)
     page.on("pageerror", lambda error: seen.faults.append(str(error)))
     page.on("response", lambda got: seen.faults.append(f"{got.status} {got.url}") if got.status >= 400 else None)
     return seen

@@ -6,7 +6,6 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Status
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
 from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate, Hypothesis
@@ -36,18 +35,14 @@ def estimate(
     return Estimate(stamp_ns, odometry, version, status, place, covariance, own, refused, innovation, others)
 
 
-def inputs(bus: MemoryBus) -> tuple[MemoryBus, str, str, RigCalibration, Intake]:
-    """What an output is opened with, after its section."""
-    intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
-    return (bus, "hall", "r1", calibration(), intake)
-
-
 def published(section: OutputSection, *estimates: object) -> dict[str, list[bytes]]:
     """Payloads by key, of estimates one after another."""
     hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
-        publisher, odom = output_of(section).open(section, *inputs(bus)), ContinuousOdom(BASE_FROM_BODY)
+        intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+        publisher = output_of(section).open(section, bus, "hall", "r1", calibration(), intake)
+        odom = ContinuousOdom(BASE_FROM_BODY)
         for one in estimates:
             publisher.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
         publisher.close()

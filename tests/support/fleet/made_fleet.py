@@ -73,9 +73,8 @@ class MadeRobot:
         said: list[Message] = [self._estimate(now_ns - NS // 2, 0.5), self._estimate(now_ns, 0.5)]
         status = self._fail(now_ns)
         if self._step > 0:
-            self._known.count(
-                self._known.driving_s, 1.0, site="", robot=self.name, version=str(self.version), tile=self._tile_key()
-            )
+            key = f"{self.tile[0]},{self.tile[1]}"
+            self._known.count(self._known.driving_s, 1.0, site="", robot=self.name, version=str(self.version), tile=key)
         self._step += 1
         said.append(self._health(now_ns, status))
         self._known.health += 1
@@ -83,9 +82,6 @@ class MadeRobot:
         if self._begun is not None and self._blind == 0:
             said.append(self._report(now_ns))
         return said
-
-    def _tile_key(self) -> str:
-        return f"{self.tile[0]},{self.tile[1]}"
 
     def _fail(self, now_ns: int) -> str:
         if self._blind > 0:

@@ -1,8 +1,9 @@
 """The bus inside one process; obeys the rules of `fleetmap.access`, as zenoh does."""
 
 import threading
-from collections.abc import Sequence
 from typing import Any
+
+import zenoh
 
 from fleetmap.access import Access, Act, Direction, _rules
 from fleetmap.bus.zenoh_bus import (
@@ -155,14 +156,4 @@ def permits(access: Access, certificate: str, flow: Direction, act: Act, key_exp
 
 def key_includes(key_expr: str, other: str) -> bool:
     """True if a key expression includes every key that `other`, a key or key expression, matches."""
-    return _includes(key_expr.split("/"), other.split("/"))
-
-
-def _includes(chunks: Sequence[str], others: Sequence[str]) -> bool:
-    if not chunks:
-        return not others
-    if chunks[0] == "**":
-        return any(_includes(chunks[1:], others[skip:]) for skip in range(len(others) + 1))
-    if not others or others[0] == "**" or chunks[0] not in {"*", others[0]}:
-        return False
-    return _includes(chunks[1:], others[1:])
+    return zenoh.KeyExpr(key_expr).includes(zenoh.KeyExpr(other))

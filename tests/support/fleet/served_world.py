@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
@@ -36,12 +35,6 @@ class World:
         self.store.save("hall", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5)))
         releases.publish(self.store, "hall")
         return self.hall.wanted()
-
-    def current_tiles(self) -> list[Tile]:
-        """The tiles of the current version as robots decode them."""
-        info = self.store.current("hall")
-        entries = self.store.manifest("hall", info.version).tiles
-        return [decode_tile(self.store.blob(entry.sha256)) for entry in entries]
 
 
 @contextmanager

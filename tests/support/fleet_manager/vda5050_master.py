@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import socket
 import subprocess
 import threading
 import time
@@ -15,7 +14,7 @@ from typing import Any
 import jsonschema_rs
 import pytest
 
-from fleetmap.bus.endpoints import with_free_port
+from fleetmap.bus.endpoints import handshake_fault, with_free_port
 
 SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050"
 PATIENCE_S = 60.0
@@ -41,18 +40,10 @@ def mosquitto(folder: Path) -> Iterator[int]:
     config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nuser root\n")
     with subprocess.Popen([program, "-c", str(config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as broker:
         try:
-            until(lambda: _answers(port), "mosquitto does not answer")
+            handshake_fault(f"tcp/127.0.0.1:{port}", None, patience_s=PATIENCE_S)
             yield port
         finally:
             broker.terminate()
-
-
-def _answers(port: int) -> bool:
-    try:
-        socket.create_connection(("127.0.0.1", port), 0.5).close()
-    except OSError:
-        return False
-    return True
 
 
 def until(found: Callable[[], bool], words: object = "", patience_s: float = PATIENCE_S) -> None:

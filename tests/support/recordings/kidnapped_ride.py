@@ -24,10 +24,6 @@ APART_FRAMES = 96  # it has not turned yet
 FRAMES = 147
 
 
-def _smooth(share: float) -> float:
-    return share**3 * (10 - 15 * share + 6 * share**2)
-
-
 def ride() -> Ride:
     """See the module; hands are never quite still."""
 
@@ -35,7 +31,8 @@ def ride() -> Ride:
         times = [stop[0] for stop in _STOPS]
         k = int(np.clip(np.searchsorted(times, t_s, side="right") - 1, 0, len(_STOPS) - 2))
         a, b = np.array(_STOPS[k]), np.array(_STOPS[k + 1])
-        share = _smooth(float(np.clip((t_s - a[0]) / (b[0] - a[0]), 0, 1)))
+        share = float(np.clip((t_s - a[0]) / (b[0] - a[0]), 0, 1))
+        share = share**3 * (10 - 15 * share + 6 * share**2)  # no jerk at either end
         x, y, yaw = a[1:] + share * (b[1:] - a[1:])
         sway = 0.03 * np.sin(2 * np.pi * share)
         return se3(so3_exp(np.array([0, 0, yaw])) @ so3_exp(np.array([sway, sway, 0])), np.array([x, y, 2 * sway]))

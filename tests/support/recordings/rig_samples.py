@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import se3_inverse
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -62,10 +62,6 @@ def write_kitti_raw(drive: Path, calibration: RigCalibration, frames: Sequence[C
             ("S_rect", size - 10),
             ("P_rect", np.zeros(12)),
         ):
-            lines.append(f"{name}_{number:02d}: {_words(values)}")
+            lines.append(f"{name}_{number:02d}: {' '.join(repr(float(value)) for value in values)}")
     (drive / "calib_cam_to_cam.txt").write_text("\n".join(lines) + "\n")
     return drive
-
-
-def _words(values: Array) -> str:
-    return " ".join(repr(float(value)) for value in values)

@@ -4,6 +4,7 @@ import hashlib
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,23 +109,12 @@ def _enveloped(file: str, magic: bytes, number: int) -> st.SearchStrategy[bytes]
     swollen = [pack(magic, number, bytes(1 << bits), level=1) for bits in (20, 24, 26)]
     return st.one_of(
         edits.map(lambda changes: edited(whole, changes)),
-        edits.map(lambda changes: pack(magic, number, edited(payload, changes), level=1)),
-        edits.map(lambda changes: pack(magic, number, edited(payload, changes), level=1)),
+        *[edits.map(lambda changes: pack(magic, number, edited(payload, changes), level=1))] * 2,
         st.tuples(st.sampled_from(swollen), st.integers(0, 19)).map(
             lambda pick: pick[0] if pick[1] == 0 else whole[pick[1] :]
         ),
         st.binary(max_size=100).map(lambda rest: magic + rest),
     )
-
-
-def tiles() -> st.SearchStrategy[bytes]:
-    """Tiles."""
-    return _enveloped("tile-2.fmtl", b"FMTL", TILE_FORMAT)
-
-
-def archives() -> st.SearchStrategy[bytes]:
-    """Surveys' archives."""
-    return _enveloped("archive-2.fmar", b"FMAR", ARCHIVE_FORMAT)
 
 
 def exports() -> st.SearchStrategy[bytes]:
@@ -164,8 +154,8 @@ def read_export(data: bytes, folder: Path) -> None:
 
 FORMATS: dict[str, tuple[Callable[[], st.SearchStrategy[bytes]], Callable[[bytes, Path], object]]] = {
     "manifest": (manifests, lambda data, _: decode_manifest(data)),
-    "tile": (tiles, lambda data, _: decode_tile(data)),
-    "archive": (archives, lambda data, _: decode_archive(data)),
+    "tile": (partial(_enveloped, "tile-2.fmtl", b"FMTL", TILE_FORMAT), lambda data, _: decode_tile(data)),
+    "archive": (partial(_enveloped, "archive-2.fmar", b"FMAR", ARCHIVE_FORMAT), lambda data, _: decode_archive(data)),
     "export": (exports, read_export),
     "grid tile": (grid_tiles, lambda data, _: decode_grid_tile(data)),
 }

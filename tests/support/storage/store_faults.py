@@ -147,8 +147,11 @@ def faults_after(folder: Path, scenario: Scenario, is_done: bool) -> list[str]:
     return found
 
 
-def strikes(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
+def tries(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
     """Number and faults of every try in which something was struck."""
+    if mode == "power cut":
+        yield from power_cuts(scenario, folder, every)
+        return
     how, is_lasting = mode.removesuffix(" from then on"), mode.endswith("from then on")
     number = hash_of(scenario.name, mode) % every
     while True:
@@ -181,12 +184,6 @@ def power_cuts(scenario: Scenario, folder: Path, every: int) -> Iterator[tuple[i
             image.apply(call)
 
 
-def _tries(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
-    if mode == "power cut":
-        return power_cuts(scenario, folder, every)
-    return strikes(scenario, folder, mode, every)
-
-
 def hash_of(*words: str) -> int:
     """A number that is the same on every run."""
     return sum(ord(sign) * (i + 1) for i, sign in enumerate("/".join(words)))
@@ -201,28 +198,34 @@ def run(
     """
     memory = Path("/dev/shm")
     started_s = time.monotonic()
-    tries: dict[str, dict[str, int]] = {}
+    tried_by: dict[str, dict[str, int]] = {}
     wrong: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
         work = Path(made)
         chosen = [scenario for scenario in scenarios(work) if names is None or scenario.name in names]
         waiting = deque(
-            (scenario, mode, _tries(scenario, work / f"store-{n}-{m}", mode, every))
+            (scenario, mode, tries(scenario, work / f"store-{n}-{m}", mode, every))
             for n, scenario in enumerate(chosen)
             for m, mode in enumerate(modes)
         )
         for scenario, mode, _ in waiting:
-            tries.setdefault(scenario.name, {})[mode] = 0
+            tried_by.setdefault(scenario.name, {})[mode] = 0
         while waiting and time.monotonic() - started_s <= within_s:
             scenario, mode, found = waiting.popleft()
             tried = next(found, None)
             if tried is None:
                 continue
             number, faults = tried
-            tries[scenario.name][mode] += 1
+            tried_by[scenario.name][mode] += 1
             if faults:
                 wrong.append({"scenario": scenario.name, "mode": mode, "call": number, "faults": faults})
             waiting.append((scenario, mode, found))
     seconds = time.monotonic() - started_s
-    total = sum(sum(counts.values()) for counts in tries.values())
-    return {"points": total, "is_complete": not waiting, "seconds": round(seconds, 1), "tries": tries, "wrong": wrong}
+    total = sum(sum(counts.values()) for counts in tried_by.values())
+    return {
+        "points": total,
+        "is_complete": not waiting,
+        "seconds": round(seconds, 1),
+        "tries": tried_by,
+        "wrong": wrong,
+    }

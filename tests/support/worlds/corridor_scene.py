@@ -27,8 +27,8 @@ class Scene:
     is_outlier: Array
 
 
-def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0) -> Scene:
-    """A drive along a corridor of points; odometry is off by `drift` (m; a tenth of it in rad) each step."""
+def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0, landmarks: int | None = None) -> Scene:
+    """A drive along a corridor of points, 25 a keyframe unless told; odometry is off by `drift` (m; a tenth of it in rad) each step."""
     rng = np.random.default_rng(seed)
     step = se3(so3_exp(np.array([0, 0, 0.01])), np.array([0.3, 0, 0]))
     true, guess = [np.eye(4)], [np.eye(4)]
@@ -37,7 +37,7 @@ def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0) -> 
         true.append(true[-1] @ step)
         guess.append(guess[-1] @ step @ error)
     map_from_body, guessed = np.array(true), np.array(guess)
-    along = map_from_body[rng.integers(0, keyframes, 25 * keyframes), :3, 3]
+    along = map_from_body[rng.integers(0, keyframes, landmarks or 25 * keyframes), :3, 3]
     ahead = rng.uniform(2, 8, len(along))
     aside = rng.choice([-2.0, 2.0], len(along)) * rng.uniform(0.5, 1, len(along))
     points = along + np.column_stack([ahead, aside, rng.uniform(-1, 1.5, len(along))])

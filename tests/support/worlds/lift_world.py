@@ -239,10 +239,6 @@ class RideResult:
     claimed_while_riding: int = 0
     floors_named: set[str] = field(default_factory=set)
 
-    @property
-    def is_in_time(self) -> bool:
-        return self.found_s is not None and self.found_m is not None and (self.found_s <= 5.0 or self.found_m <= 3.0)
-
 
 def ride(world: LiftWorld, level: int, out_m: float = 8.0, **how: float) -> RideResult:
     """Drive into the lift, ride, and back out of it; the camera looks at the cabin's back wall until the robot has left it."""

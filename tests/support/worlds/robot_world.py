@@ -11,7 +11,7 @@ import numpy as np
 from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
@@ -203,16 +203,10 @@ def loaded(store: MapStore, of: tuple[Tile, ...] | None = None, *, site: str = S
 
 def moved(offset_m: Array) -> tuple[Tile, ...]:
     """The same map somewhere else: what a version would be whose frame has slipped."""
+    shift = se3(np.eye(3), offset_m)
     return tuple(
-        replace(tile, points_map=tile.points_map + offset_m, map_from_cam=_shifted(tile.map_from_cam, offset_m))
-        for tile in tiles()
+        replace(tile, points_map=tile.points_map + offset_m, map_from_cam=shift @ tile.map_from_cam) for tile in tiles()
     )
-
-
-def _shifted(map_from_cam: Array, offset_m: Array) -> Array:
-    out = map_from_cam.copy()
-    out[:, :3, 3] += offset_m
-    return out
 
 
 def new_robot(trial: TrialSettings = TRIAL) -> Robot:

@@ -1,5 +1,6 @@
 """Whoever does the work of a survey, the map is the same to the byte."""
 
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -73,13 +74,9 @@ def tls_cluster(workers: int) -> Iterator[LocalCluster]:
         yield there
 
 
-def _added(shared: int, batch: int) -> int:
-    return shared + batch
-
-
 def test_a_cluster_that_is_lost_is_told() -> None:
     with tls_cluster(1) as there, open_executor(1, there.scheduler_address) as executor:
-        found = executor.map(_added, 100, range(30))
+        found = executor.map(operator.add, 100, range(30))
         assert next(found) == 100
         there.close()
         with pytest.raises(LinkError, match="lost the build"):

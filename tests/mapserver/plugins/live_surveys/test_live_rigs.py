@@ -108,14 +108,10 @@ def drive(site: Site, record: Path, sensors: "Scripted", names: Topics) -> list[
     return told
 
 
-def not_begun(*_: object) -> MappingHere:
-    raise AssertionError("the drive began")
-
-
 def test_what_a_build_would_refuse_is_refused_before_the_drive(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(MappingHere, "start", not_begun)
+    monkeypatch.setattr(MappingHere, "start", lambda *_: pytest.fail("the drive began"))
     config = configured(tmp_path, site, SensorSet.STEREO)
     other = tmp_path / "other.yaml"
     rig = yaml.safe_load(kalibr_text())  # of which the right camera looks down by a degree

@@ -9,7 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from fleetmap import core
-from fleetmap.geometry import AnyArray, Array, se3_exp, se3_inverse
+from fleetmap.geometry import Array, se3_exp, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import minimum_degree, solver_of
 from mapserver.survey.bundle.problem import BundleProblem, ImageRows, InertialTerms, MotionPrior, SelfCalibration
 from mapserver.survey.settings import BundleSettings
@@ -66,10 +66,6 @@ def matrix_of(solver: core.BundleSolver) -> Array:
     return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
-def superlu(matrix: Array, rhs: Array) -> AnyArray:
-    return scipy.sparse.linalg.splu(scipy.sparse.csc_array(matrix)).solve(rhs)
-
-
 @pytest.fixture(params=PATTERNS)
 def pairs(request: pytest.FixtureRequest) -> list[tuple[int, int]]:
     return [(i, j) for i, j in PATTERNS[request.param](np.random.default_rng(1)) if i != j]
@@ -80,7 +76,8 @@ def test_solves_as_superlu_does(pairs: list[tuple[int, int]], kind: str) -> None
     solver = solver_of(problem(pairs, kind), SPARSE)
     matrix, rhs, step = matrix_of(solver), solver.reduced(0.0)[1], solver.step(0.0)
     np.testing.assert_allclose(matrix @ step, rhs, atol=1e-10 * np.abs(rhs).max())
-    np.testing.assert_allclose(step, superlu(matrix, rhs), atol=1e-9)
+    superlu = scipy.sparse.linalg.splu(scipy.sparse.csc_array(matrix))
+    np.testing.assert_allclose(step, superlu.solve(rhs), atol=1e-9)
     assert solver.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-10)
 
 

@@ -56,7 +56,8 @@ def test_same_optimum_as_gtsam(huber: float) -> None:
     if huber < 10:
         wild = np.random.default_rng(8).random(len(start.obs_pixels)) < 0.03
         start.obs_pixels[wild] += 15.0
-    ours = optimize(start, _patient(huber))
+    patient = BundleSettings(max_iterations=200, relative_cost_tolerance=1e-12, huber_sigmas=huber)
+    ours = optimize(start, patient)
     graph, values = gtsam_graph(start, huber)
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-14)
@@ -67,10 +68,6 @@ def test_same_optimum_as_gtsam(huber: float) -> None:
     assert ours.costs[-1] == pytest.approx(graph.error(optimum), rel=1e-7)
     for k in range(6):
         np.testing.assert_allclose(ours.map_from_body[k], optimum.atPose3(gtsam.symbol("x", k)).matrix(), atol=1e-4)
-
-
-def _patient(huber: float) -> BundleSettings:
-    return BundleSettings(max_iterations=200, relative_cost_tolerance=1e-12, huber_sigmas=huber)
 
 
 def test_wild_observations_under_huber_and_cutoff() -> None:

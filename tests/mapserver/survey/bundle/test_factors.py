@@ -43,7 +43,7 @@ def _imu(scene: Scene) -> ImuSamples:
 def test_sparse_frames_converge_to_the_truth(step_s: float, dense_unknowns: int) -> None:
     scene = make_scene(keyframes=12, landmarks=300, step_s=step_s, seed=21, inertial=True)
     problem = _unknowing(scene, seed=22)
-    settings = _within(dense_unknowns)
+    settings = BundleSettings(max_iterations=40, relative_cost_tolerance=1e-8, dense_unknowns=dense_unknowns)
     for _ in range(3):
         result = optimize(problem, settings)
         problem = continued(problem, result)
@@ -56,10 +56,6 @@ def test_sparse_frames_converge_to_the_truth(step_s: float, dense_unknowns: int)
     np.testing.assert_allclose(result.motions[:, 3:6], np.tile(GYRO_BIAS, (12, 1)), atol=2e-4)
     np.testing.assert_allclose(result.motions[:, 6:], np.tile(ACCEL_BIAS, (12, 1)), atol=2e-2)
     np.testing.assert_allclose(result.motions[:, :3], scene.velocities_map_mps, atol=1e-2)
-
-
-def _within(dense_unknowns: int) -> BundleSettings:
-    return BundleSettings(max_iterations=40, relative_cost_tolerance=1e-8, dense_unknowns=dense_unknowns)
 
 
 def test_gravity_decides_roll_and_pitch() -> None:
@@ -97,7 +93,8 @@ def test_same_optimum_as_gtsam() -> None:
     scene = make_scene(keyframes=6, landmarks=120, step_s=0.5, seed=35, noise_px=1.0, inertial=True)
     problem = disturbed(scene.problem, seed=36, rot_rad=0.01, trans_m=0.05, points_m=0.05)
     assert problem.inertial is not None
-    ours = optimize(problem, _unrobust())
+    unrobust = BundleSettings(max_iterations=100, relative_cost_tolerance=1e-12, huber_sigmas=1e6)
+    ours = optimize(problem, unrobust)
     graph, values = gtsam_graph(problem, 1e6)
     imu = _imu(scene)
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
@@ -124,7 +121,3 @@ def test_same_optimum_as_gtsam() -> None:
     assert ours.costs[-1] == pytest.approx(graph.error(optimum), rel=2e-3)
     for k in range(6):
         np.testing.assert_allclose(ours.map_from_body[k], optimum.atPose3(gtsam.symbol("x", k)).matrix(), atol=5e-4)
-
-
-def _unrobust() -> BundleSettings:
-    return BundleSettings(max_iterations=100, relative_cost_tolerance=1e-12, huber_sigmas=1e6)

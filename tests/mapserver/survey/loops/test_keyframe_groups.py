@@ -22,14 +22,10 @@ def truth() -> Array:
     return np.array([*along, *back])
 
 
-def believed() -> Array:
-    """What odometry makes of it, which takes the second part to begin where the first one ended."""
-    placed = truth()
-    return np.array([*placed[:6], *(placed[5] @ se3_inverse(placed[6]) @ placed[6:])])
-
-
 def marginals() -> GraphMarginals:
-    placed = believed()
+    """By odometry, which takes the second part to begin where the first one ended."""
+    placed = truth()
+    placed[6:] = placed[5] @ se3_inverse(placed[6]) @ placed[6:]
     return GraphMarginals(placed, chain_of(placed, [*[SURE] * 5, LOST, *[SURE] * 5]))
 
 
