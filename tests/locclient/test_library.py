@@ -1,13 +1,10 @@
-"""locclient as a library: the public names, a light import, and the two documented ways to a pose."""
+"""locclient as a library: the two documented ways to a pose."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import locclient
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
@@ -31,15 +28,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("drive"), robot_world.cycle())
-
-
-def test_public_names_exist_and_the_import_is_light() -> None:
-    assert all(getattr(locclient, name) is not None for name in locclient.__all__)
-    assert dir(locclient) == sorted(locclient.__all__)
-    with pytest.raises(AttributeError, match="localise"):
-        _ = locclient.localise
-    heavy = "import sys, locclient; print([m for m in ('numpy', 'cv2', 'zenoh') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", heavy], check=True, capture_output=True, text=True).stdout == "[]\n"
 
 
 def test_a_recording_is_localized_in_a_store(drive: Path, store: Path, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import mapserver
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from mapserver import Actor, BuildOptions, build_map, open_map, open_store
 
@@ -43,28 +42,6 @@ def test_a_map_in_five_lines(room_ride: Path, tmp_path: Path) -> None:
 def test_a_wrong_site_name_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="site name"):
         build_map([tmp_path / "nowhere"], tmp_path / "maps", "Hall 1")
-
-
-@pytest.mark.parametrize(
-    ("imported", "unneeded"),
-    [
-        ("mapserver; mapserver.__version__", "numpy cv2 gtsam scipy fastapi"),
-        # scipy.stats alone takes half a second.
-        ("mapserver.library", "scipy.stats scipy.optimize matplotlib fastapi jinja2 distributed zenoh"),
-        # Every command reads one, and the server keeps it; these take most of a second, and 100 MB of the server.
-        ("mapserver.config", "cv2 gtsam"),
-    ],
-)
-def test_importing_loads_no_library_that_is_not_needed(imported: str, unneeded: str) -> None:
-    script = f"import sys, {imported}; print([m for m in {unneeded.split()} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
-
-
-def test_a_name_that_it_does_not_have() -> None:
-    assert set(mapserver.__all__) <= set(dir(mapserver))
-    with pytest.raises(AttributeError, match="nonsense"):
-        _ = mapserver.nonsense
 
 
 def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:

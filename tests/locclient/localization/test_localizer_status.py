@@ -425,23 +425,6 @@ def test_frames_without_a_fix_count_together_until_the_next_one(
     assert asked == pooled
 
 
-def test_darkness_is_named_within_a_second(tracking: Robot) -> None:
-    tracking.is_dark = True
-    said = [tracking.go(0.2, NO_FIX) for _ in range(5)]
-    assert said[-1].status is Status.DEGRADED
-    assert said[-1].cause is Cause.DARK
-    assert said[0].cause is Cause.NONE
-    tracking.is_dark = False
-    after = tracking.ride(3, 0.2)[-1]
-    assert (after.status, after.cause) == (Status.TRACKING, Cause.NONE)
-
-
-def test_what_was_never_seen_says_so(tracking: Robot) -> None:
-    said = [tracking.go(0.2, NO_FIX) for _ in range(9)]
-    assert said[-1].status is Status.DEGRADED
-    assert said[-1].cause is Cause.UNMATCHED
-
-
 def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(tracking: Robot) -> None:
     """Believed: where it was found. Refused beside the prediction: how far. Refused elsewhere: it may be a twin, which says nothing."""
     tracking.go(0.4, [off(0.03)])

@@ -44,13 +44,6 @@ sys.argv = ["{package}", "--help"]
     assert shown.splitlines()[-1] == "[]"
 
 
-def test_neither_a_server_nor_a_build_begins_with_solvers() -> None:
-    """A server builds in processes of their own, and a build that is refused solves nothing."""
-    late = ("gtsam", "scipy.linalg", "scipy.sparse", "scipy.special", "matplotlib", "distributed")
-    code = f"import sys, mapserver.library, mapserver.server; print([m for m in {late!r} if m in sys.modules])"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True, cwd=REPOSITORY) == "[]\n"
-
-
 def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)

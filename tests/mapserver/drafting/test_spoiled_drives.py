@@ -10,11 +10,12 @@ import pytest
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.sensors.samples import CameraFrame, ImuSamples
+from fleetmap.sensors.samples import ImuSamples
 from mapserver.drafting.admission import CheckedRecording, checked
 from mapserver.drafting.survey_recordings import BegunSurvey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
+from support.recordings.calibration_faults import swapped
 from support.recordings.realdata import real_data
 
 X, Y = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])
@@ -27,15 +28,6 @@ def imu(gyro: Array | float = 1.0, accel: Array | float = 1.0, late_ns: int = 0)
         return ImuSamples(of.stamps_ns + late_ns, of.gyro_radps * gyro, of.accel_mps2 * accel)
 
     return lambda recording: replace(recording, imu=changed(recording.imu))
-
-
-def swapped(recording: Recording) -> Recording:
-    class Swapped:
-        def frame(self, index: int) -> CameraFrame:
-            frame = recording.read_frame(index)
-            return replace(frame, left=frame.right, right=frame.left)
-
-    return replace(recording, frames=Swapped())  # type: ignore[arg-type]
 
 
 def wider(recording: Recording) -> Recording:

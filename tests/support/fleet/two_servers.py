@@ -1,47 +1,35 @@
 """Two servers of one store in PostgreSQL and S3, behind a balancer, of which one after the other is killed while robots report and ask.
 
-    python tests/support/fleet/two_servers.py [--robots 300] [--seconds 600] [--kill-every 60] [--database URL --content URL]
-
-Robots deliver failures until they are acknowledged, and ask for their version. Afterwards the store must hold each acknowledged failure,
-once, in its rows and in its sums. Without URLs it starts PostgreSQL and rclone's S3 server.
+`PYTHONPATH=tests python -m support.fleet.two_servers [--robots N] [--seconds N] [--kill-every N] [--every N] [--out FILE.json]`.
+Robots deliver failures until they are acknowledged, and ask for their version, both every so many seconds. Afterwards the store must hold
+each acknowledged failure, once, in its rows and in its sums.
 """
 
-import argparse
 import asyncio
-import json
 import os
 import random
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "", "tests")]
-
-from fleetmap.bus.endpoints import with_free_port  # noqa: E402
-from fleetmap.bus.zenoh_bus import Bus  # noqa: E402
-from fleetmap.errors import FleetmapError  # noqa: E402
-from fleetmap.messages import (  # noqa: E402
-    FailureAck,
-    WantedVersion,
-    decode_message,
-    encode_message,
-    robot_key,
-)
-from mapserver.store import FailureFilter, MapStore, chain_faults  # noqa: E402
-from mapserver.store.places import Places  # noqa: E402
-from mapserver.trust import init_here  # noqa: E402
-from support.fleet.reports import blindness  # noqa: E402
-from support.storage.map_samples import publish_samples  # noqa: E402
-from support.storage.postgres_server import postgres_server  # noqa: E402
-from support.storage.s3_server import KEYS, s3_server  # noqa: E402
+from benchmarks.common.recorded_runs import Options, Results, benchmark, tool
+from fleetmap.bus.endpoints import with_free_port
+from fleetmap.bus.zenoh_bus import Bus
+from fleetmap.errors import FleetmapError
+from fleetmap.messages import FailureAck, WantedVersion, decode_message, encode_message, robot_key
+from mapserver.store import FailureFilter, MapStore, chain_faults
+from mapserver.store.places import Places
+from mapserver.trust import init_here
+from support.fleet.reports import blindness
+from support.storage.map_samples import publish_samples
+from support.storage.postgres_server import postgres_server
+from support.storage.s3_server import KEYS, s3_server
 
 _ANSWER_WITHIN_S = 2.0
 
@@ -78,10 +66,9 @@ class Servers:
         return [process.wait(timeout=30) for process in self._processes]
 
     def _started(self, number: int) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "mapserver.cli", "serve", "--store", str(self.folders[number])]
+        command = [*tool("mapserver"), "serve", "--store", str(self.folders[number])]
         command += ["--http", "127.0.0.1:0", "--zenoh", self._endpoints[number]]
-        sources = os.pathsep.join(str(REPOSITORY / part) for part in ("shared", ""))
-        return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": sources}, stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
     def _balance(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -185,26 +172,9 @@ def run(
     }  # fmt: skip
 
 
-def main() -> None:
-    """Run with the options above, and print the result as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", type=int, default=300)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--kill-every", type=float, default=60.0)
-    parser.add_argument("--every", type=float, default=5.0, help="seconds between two questions of a robot")
-    parser.add_argument("--database")
-    parser.add_argument("--content")
-    given = parser.parse_args()
-    with ExitStack() as stack:
-        if given.database is None:
-            given.database = stack.enter_context(postgres_server()).database()
-            address = stack.enter_context(s3_server(Path(stack.enter_context(tempfile.TemporaryDirectory()))))
-            os.environ |= KEYS | {"AWS_ENDPOINT_URL": address}
-            given.content = "s3://fleet/two-servers"
-        print(
-            json.dumps(run(given.database, given.content, given.robots, given.seconds, given.kill_every, given.every))
-        )
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(robots=300, seconds=600, kill_every=60, every=5)
+def main(arguments: Options) -> Results:
+    with postgres_server() as postgres, tempfile.TemporaryDirectory() as folder, s3_server(Path(folder)) as address:
+        os.environ |= KEYS | {"AWS_ENDPOINT_URL": address}
+        how = (arguments.robots, arguments.seconds, arguments.kill_every, arguments.every)
+        return run(postgres.database(), "s3://fleet/two-servers", *how)

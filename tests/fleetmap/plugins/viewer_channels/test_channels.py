@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.errors import UsageError
 from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_exp
 from fleetmap.messages import FailureReport, Placement
-from fleetmap.plugins.viewer_channels import channels, require_foxglove
+from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import CHANNELS, RobotMark
 from fleetmap.sensors.rectification import StereoCamera
 from support.fleet.contracts_documents import REPOSITORY
@@ -103,15 +102,6 @@ def test_a_failure_nowhere_has_no_place() -> None:
         found = channels.failure(STAMP_NS, failure(map_from_base=placed, kind="suspected", tile=None), [])
         assert [message.topic for message in found] == ["/failures/log", "/failures/report"]
         assert decoded(found[0]).level == 3
-
-
-def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    require_foxglove("--foxglove")
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(UsageError, match=r"--foxglove needs foxglove.*pip install '\.\[foxglove\]'"):
-        require_foxglove("--foxglove")
 
 
 # The layout in `deploy/` shows channels that there are, and every panel stands in it.
