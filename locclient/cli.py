@@ -49,14 +49,11 @@ def run(
 
     log_to_stderr(logging.INFO if verbose else logging.WARNING, "%(levelname)s %(name)s: %(message)s")
     from locclient.config import with_insecure
-    from locclient.daemon.daemon import check_run, daemon_parts
-
-    settings = with_insecure(context.obj(config)[0], insecure=insecure)
-
-    check_run(settings)
+    from locclient.daemon.daemon import daemon_parts
     from locclient.daemon.runtime import Runtime
     from locclient.daemon.service_manager import ServiceManager
 
+    settings = with_insecure(context.obj(config)[0], insecure=insecure)
     with daemon_parts(settings) as parts:
         runtime = Runtime(parts, ServiceManager())
         for number in (signal.SIGTERM, signal.SIGINT):

@@ -92,7 +92,11 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
     if path is None:
         return LocclientConfig(), {}
     defaults, tiers = with_plugins()
-    given = with_common(read_given(path, file_type(type(defaults), commands)))
+    given = read_given(path, file_type(type(defaults), commands))
+    for name in ("run", "replay"):  # which the top-level keys complete
+        section: dict[str, Any] = given.get(name, {})
+        keys = {"site"} if {"store", "server"} & section.keys() else {"site", "store", "server"}
+        given[name] = {key: given[key] for key in keys if key in given} | section
     refuse_internal(path, given, defaults, tiers)
     settings = {key: given[key] for key in defaults.__struct_fields__ if key in given}
     return msgspec.convert(settings, type(defaults)), command_defaults(given, commands)
@@ -118,16 +122,6 @@ def image_priors_of(config: LocclientConfig, mounted: MountedCamera, base_from_b
     sections = ((hook, getattr(config, name, None)) for name, hook in prior_hooks().items())
     opened = (hook.open(section, mounted, base_from_body) for hook, section in sections if section is not None)
     return [prior for prior in opened if prior is not None]
-
-
-def with_common(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a file, with [run] and [replay] completed by the top-level keys."""
-    completed = dict(given)
-    for name in ("run", "replay"):
-        section: dict[str, Any] = given.get(name, {})
-        keys = {"site"} if {"store", "server"} & section.keys() else {"site", "store", "server"}
-        completed[name] = {key: given[key] for key in keys if key in given} | section
-    return completed
 
 
 def with_insecure(config: LocclientConfig, *, insecure: bool) -> LocclientConfig:

@@ -11,8 +11,7 @@
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fleetmap.config import Section
 from fleetmap.hooks import plugins
@@ -34,8 +33,7 @@ if TYPE_CHECKING:
     from locclient.outputs import OutputSection, Publisher
 
 
-@dataclass(frozen=True)
-class LinkedRobot:
+class LinkedRobot(NamedTuple):
     """What a link may use of its robot. lost_radius_m: 95 % radius beyond which a pose is LOST.
 
     client: with the cache, on the thread of `RobotLink.work`; its `trust` is None without a map server. offer: passes a version to the
@@ -49,8 +47,7 @@ class LinkedRobot:
     put_prior: Callable[[PositionPrior], None]
 
 
-@dataclass(frozen=True)
-class RobotLink:
+class RobotLink(NamedTuple):
     """An open link, as the functions that the daemon calls: `start` and `stop` with its own threads.
 
     work: what may block, repeatedly on the network's thread. after_frame: the results of a frame, the versions in use, the building, and
@@ -67,8 +64,7 @@ class RobotLink:
     chooses: str = ""
 
 
-@dataclass(frozen=True)
-class LinkHook:
+class LinkHook(NamedTuple):
     """A link of the robot to another system. section: all its keys may be set.
 
     is_on: whether the section asks for it; the robot may then be without a map server. check: raises UsageError for invalid settings; the
@@ -81,8 +77,7 @@ class LinkHook:
     open: Callable[[Any, LinkedRobot], RobotLink]
 
 
-@dataclass(frozen=True)
-class OutputHook:
+class OutputHook(NamedTuple):
     """A format of estimates for the robot's own programs. check: raises UsageError for settings of [output] that do not suit [topics].
 
     open: by the bus at [output] endpoint or the map server's, the names of site and robot, and the rig; the intake receives commands of the
@@ -94,8 +89,7 @@ class OutputHook:
     needs_bus: bool = True
 
 
-@dataclass(frozen=True)
-class PriorHook:
+class PriorHook(NamedTuple):
     """What tells a robot its place by its images. section: all its keys may be set.
 
     open: by the section, the rig's first camera, and base_from_body (4, 4); None if the section does not ask for it. UsageError for

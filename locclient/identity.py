@@ -109,13 +109,10 @@ class RobotIdentity:
         with disk_errors(f"{folder} cannot be written", "choose another folder by --identity"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             folder.chmod(0o700)
-        for name, data in (
-            ("servers.ca", given.servers.encode()),
-            ("root.json", given.root.encode()),
-            ("bundle.pem", given.own.encode()),
-            ("identity.json", to_json(who)),
-        ):
-            made._write(name, data)
+        made._write("servers.ca", given.servers.encode())
+        made._write("root.json", given.root.encode())
+        made._write("bundle.pem", given.own.encode())
+        made._write("identity.json", to_json(who))
         first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")
         if fault := handshake_fault(who.endpoint, first):
             raise LinkError(f"{who.endpoint}: {fault}")

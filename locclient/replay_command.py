@@ -1,6 +1,6 @@
 """`locclient replay`: localization of a recording in a published map."""
 
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -192,25 +192,23 @@ def _run(
     from locclient.replay.replay import ReplayOptions, load_map, spread_starts, starts
     from locclient.replay.replay import replay as play
 
-    opening_export: AbstractContextManager[RunExport | None] = nullcontext()
-    if files.mcap is not None:
-        opening_export = plugin("locclient.run_exports", "mcap", "--mcap")(files.mcap)
+    opening = None if files.mcap is None else plugin("locclient.run_exports", "mcap", "--mcap")(files.mcap)
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     use = None if playback.use is None else named_sensor_set(playback.use)
-    opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
+    how = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = plain_console(stderr=True)
     with ExitStack() as stack:
-        recording = reduced(stack.enter_context(open_recording(path, opening)), use)
+        recording = reduced(stack.enter_context(open_recording(path, how)), use)
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
-        export = stack.enter_context(opening_export)
+        export: RunExport | None = None if opening is None else stack.enter_context(opening)
         maps = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
         with Progress(console=console, disable=not console.is_terminal) as bar:
             for issue in recording.issues:
                 console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
-            how = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
-            result = play(source, maps, ReplayOptions(*how, partial(image_priors_of, settings), address.robot), prior)
+            told = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
+            result = play(source, maps, ReplayOptions(*told, partial(image_priors_of, settings), address.robot), prior)
         report, more = result.report, dict[str, object]()
         if playback.starts:
             numbers, loaded = spread_starts(source, playback.starts), load_map(maps)[0]

@@ -135,16 +135,15 @@ def _opened_outbox(file: Path, max_bytes: int) -> Outbox:
 
 
 def _keep_recordings(
-    server: ServerSync, run: RunSection, spool: Path, profile: RobotProfile, publisher: Publisher | None
+    server: ServerSync, run: RunSection, spool: Path, profile: RobotProfile, publisher: Publisher
 ) -> ReplayQueue | None:
     """Keep recordings of failures, None if none are wanted, and of drives until the server has them; fetch what the publisher needs."""
-    server.client.takes_grids = publisher is not None and publisher.grid_height_m is not None
+    server.client.takes_grids = publisher.grid_height_m is not None
     if run.surveys:
         server.drives = SurveyDrives(spool.with_name(f"{spool.stem}.drives"), profile.rig.calibration)
     if server.is_alone or run.replays == "off":
         return None
-    replays = spool.with_name(f"{spool.stem}.replays{spool.suffix}")
-    server.replays = _opened_outbox(replays, run.replays_bytes)
+    server.replays = _opened_outbox(spool.with_name(f"{spool.stem}.replays{spool.suffix}"), run.replays_bytes)
     return ReplayQueue(server.replays, profile)
 
 
@@ -155,13 +154,13 @@ def _opened_publisher(
     bus: Bus | None,
     calibration: RigCalibration,
     intake: Intake,
-) -> Publisher | None:
-    """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; None without one that it needs."""
+) -> Publisher:
+    """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; to nobody without one it needs."""
     output = output_of(config.output)
     if config.output.endpoint is not None:
         bus = stack.enter_context(Bus(config.output.endpoint).open())
     elif output.needs_bus and (bus is None or address.server is None):
-        return None
+        return Publisher()
     publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)
     stack.callback(publisher.close)
     return publisher

@@ -10,9 +10,10 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +50,7 @@ _NO_GRID = OccupancyGrid(np.full((1, 1), UNKNOWN, np.int8), 0.05, np.eye(4))  # 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class RuntimeParts:
+class RuntimeParts(NamedTuple):
     """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with."""
 
     profile: RobotProfile
@@ -60,7 +60,7 @@ class RuntimeParts:
     tile_loader: TileLoader
     outbox: Outbox
     replays: ReplayQueue | None
-    publisher: Publisher | None
+    publisher: Publisher
     server: ServerSync | None
     first: WantedVersion | None
     failures_folder: Path | None = None
@@ -89,7 +89,7 @@ class Runtime:
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._refusals = LogLimit(_log)
         self._counts: dict[str, int] = {}  # of the intake, when losses were told last
-        self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
+        self._outbox_counts = dict[str, Figure]()
         # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._fetched_again: set[tuple[WantedVersion, str]] = set()
@@ -191,8 +191,7 @@ class Runtime:
     def _after_frame(self, outcome: Outcome) -> None:
         estimate = outcome.estimate
         self._site = estimate.floor
-        if self._publisher is not None:
-            _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
+        _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
         for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.versions.held)
             visited = {site: loaded.version for site, loaded in self._robot.visited.items()}
@@ -231,8 +230,7 @@ class Runtime:
             link.silence()
         if self._server is not None:
             self._server.health.append(self._health())
-        if self._publisher is not None:
-            _send(partial(self._publisher.alive, is_silent))
+        _send(partial(self._publisher.alive, is_silent))
         last = self._figures.last
         status = "no frame yet" if last is None else last.estimate.status.value
         self._manager.alive("no frames come" if is_silent else status)
@@ -253,13 +251,10 @@ class Runtime:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
         with suppress(StoreError):  # logged by the disk or network thread
             self._outbox_counts = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
-        for fault in [fault for cache in self._parts.caches for fault in cache.take_faults()]:
-            _log.warning("tile cache: %s", fault)
-            self._cache_faults += 1
         tiles = {
             "tiles_held": sum(len(loaded.tiles) for loaded in self._robot.versions.held),
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
-            "cache_faults": self._cache_faults,
+            "cache_faults": sum(cache.faults for cache in self._parts.caches),
         }
         if self._server is not None:
             trust = self._server.client.trust
@@ -312,15 +307,14 @@ class Runtime:
         """Publish the grid of the map in which the robot is: of the confirmed version, or of another site's. If an older client did not
         fetch it with the version, fetch it now, once."""
         publisher, site, building = self._publisher, self._site, self._parts.building
-        height_m = None if publisher is None else publisher.grid_height_m
         if site and building is not None:
             version = building.held.get(site, version)
-        if publisher is None or height_m is None or (site, version) == self._shown_grid:
+        if publisher.grid_height_m is None or (site, version) == self._shown_grid:
             return
         was_elsewhere = self._shown_grid is not None and self._shown_grid[0] != site
         self._shown_grid, grid, why = (site, version), None, ""
         try:
-            grid = self._parts.tile_loader.grid(version, height_m)
+            grid = self._parts.tile_loader.grid(version, publisher.grid_height_m)
         except FleetmapError as error:
             why = str(error)
             if was_elsewhere:  # a planner must not use the grid of where the robot was

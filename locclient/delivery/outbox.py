@@ -8,8 +8,8 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from fleetmap.errors import StoreError
 from fleetmap.files import OWN_FILE
@@ -26,8 +26,7 @@ _KEPT_NS = 7 * 86_400 * 1_000_000_000
 _BUSY_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class QueuedReport:
+class QueuedReport(NamedTuple):
     """A waiting report; payload: the encoded message."""
 
     id: str
@@ -152,14 +151,9 @@ class Outbox:
         if not self._is_made:
             self._make()
         try:
-            with closing(self._open()) as database:
+            with closing(self._open()) as database, database:  # whose end commits, or takes all back after an error
                 database.execute(f"BEGIN {kind}")
-                try:
-                    yield database
-                except BaseException:
-                    database.execute("ROLLBACK")
-                    raise
-                database.execute("COMMIT")
+                yield database
         except sqlite3.Error as error:
             raise StoreError(
                 f"the spool {self._path} refused ({error}); is its disk full, read-only or damaged?"

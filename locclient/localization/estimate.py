@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.settings import TrackSettings
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
+class Hypothesis(NamedTuple):
     """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it. floor: whose map, see `Estimate`."""
 
     map_from_body: Array

@@ -365,8 +365,6 @@ def connected(
     cache = TileCache(cache_folder(cache_setting), max_bytes=cache_bytes)
     with open_bus(address) as bus:
         yield map_client(bus, cache, address)
-        for fault in cache.take_faults():
-            _log.warning("tile cache: %s", fault)
 
 
 def cache_folder(setting: str | Path | None = None) -> Path:

@@ -6,9 +6,8 @@ import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fleetmap.bow.vocabulary import decode_vocabulary, shipped_vocabulary
 from fleetmap.errors import (
@@ -29,8 +28,7 @@ from locclient.maps.loaded_map import Cell, LoadedMap
 from locclient.maps.tile_cache import TileCache
 
 
-@dataclass(frozen=True)
-class ReadyVersion:
+class ReadyVersion(NamedTuple):
     """The version to run now. note: reason why it is not the wanted one, or incomplete; else empty."""
 
     wanted: WantedVersion
@@ -90,8 +88,7 @@ class MapSource(ABC):
                 try:
                     if away is not None and not self._is_at_hand(entry.sha256):
                         raise away
-                    data = self.blob(entry.sha256, entry.bytes)
-                    tiles[cell] = checked_tile(entry, manifest.tile_size_m, data)
+                    tiles[cell] = checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
                 except FleetmapError as error:
                     away = error if isinstance(error, UnreachableError) else away
                     refused[cell] = str(error)

@@ -1,7 +1,7 @@
 """The robot's disk cache of map bytes, addressed by their SHA-256 and bounded in size."""
 
+import logging
 import os
-from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +16,7 @@ from fleetmap.mapformat.names import blob_path, check_name, check_sha256, verifi
 from fleetmap.messages import WantedVersion
 
 DEFAULT_MAX_BYTES = 2_000_000_000
-_MAX_FAULTS = 100  # kept until `take_faults`
+_log = logging.getLogger(__name__)
 
 
 class ActiveVersion(msgspec.Struct, frozen=True):
@@ -32,17 +32,15 @@ class ActiveVersion(msgspec.Struct, frozen=True):
 class TileCache:
     """Files below one folder. Above `max_bytes` the least recently used are evicted, never those of an active, kept or reserved version.
 
-    Bytes are verified on every read. A disk error affects the cache, not the robot's map: `take_faults` has the reasons.
-    For one thread at a time, except `take_faults`. One process should use a folder; a second one does no harm but may evict files
-    that the first one needs.
+    Bytes are verified on every read. A disk error affects the cache, not the robot's map: it is logged, and counted in `faults`.
+    For one thread at a time. One process should use a folder; a second one does no harm but may evict files that the first one needs.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         """Create the folder; StoreError if that fails."""
         self.folder = folder
         self._max_bytes = max_bytes
-        self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
-        self._last_fault = ""
+        self.faults, self.last_fault = 0, ""
         self._reserved: dict[str, frozenset[str]] = {}
         with disk_errors(f"the cache {folder} cannot be used", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
@@ -112,11 +110,11 @@ class TileCache:
         if missing:
             raise StoreError(
                 f"version {version} of {site} is not whole: {len(missing)} of {len(blobs)} pieces are missing, "
-                f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
+                f"{missing[0]} first; {self.last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
         if record != self._active.get(site) and not self._write(self._site_path(site) / "active", to_json(record)):
-            raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
+            raise StoreError(f"version {version} of {site} cannot be made active: {self.last_fault}")
         self._active[site] = record
         self._reserved.pop(site, None)
         self._evict(keep="")
@@ -130,7 +128,7 @@ class TileCache:
         record = ActiveVersion(version, tuple(blobs))
         if missing or not self._write(self._site_path(site) / "kept" / str(version), to_json(record)):
             raise StoreError(
-                f"version {version} of {site} is not kept: {self._last_fault or f'{missing[0]} is missing'}"
+                f"version {version} of {site} is not kept: {self.last_fault or f'{missing[0]} is missing'}"
             )
         self._kept[site, version] = record
 
@@ -170,13 +168,9 @@ class TileCache:
         """Return the free bytes beside the protected files."""
         return self._max_bytes - sum(self._sizes.get(sha256, 0) for sha256 in self._used())
 
-    def take_faults(self) -> list[str]:
-        """Return texts of disk faults since the last call. Thread-safe."""
-        return [self._faults.popleft() for _ in range(len(self._faults))]
-
     def _note(self, fault: str) -> None:
-        self._last_fault = fault
-        self._faults.append(fault)
+        _log.warning("tile cache: %s", fault)
+        self.faults, self.last_fault = self.faults + 1, fault
 
     def _read_record(self, path: Path) -> ActiveVersion | None:
         try:

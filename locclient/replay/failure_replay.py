@@ -6,10 +6,11 @@ or a newer localizer gets the same percepts; depth of features is known where th
 odometry, which does not depend on the map, is unchanged.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from math import dist, pi, remainder
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,31 +30,8 @@ from locclient.robot.failure_ring import UsedMap, moment_of
 
 SAME_M, SAME_RAD = 0.01, np.radians(0.5)  # maximum difference of equal poses
 
-Load = Callable[[UsedMap], LoadedMap]
-"""Loads the map that replaces the robot's."""
 
-
-def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
-    """Return the results of the present localizer for every frame. Errors as of `load`."""
-    mounted = (MountedCamera(record.camera, record.body_from_cam), *record.others)
-    localizer = Localizer(MountedRig(RigCalibration((), None, record.base_from_body), mounted), record.settings)
-    if record.used is not None:
-        load(record.used).show(localizer, record.used.floor)
-    localizer.begin(record.start)
-    said = []
-    for commands, percept in record.frames:
-        if commands.used is not None:
-            load(commands.used).show(localizer, commands.used.floor)
-        if commands.forgets:
-            localizer.forget_pose()
-        for prior in commands.priors:
-            localizer.handle_prior(prior)
-        said.append(moment_of(localizer.localize(percept)))
-    return said
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
+class Comparison(NamedTuple):
     """Results then and now, by the same stamps; version: of the map used now."""
 
     summary: FailureSummary
@@ -123,14 +101,27 @@ def compare_failure(
     summary, record = failure
     maps: dict[UsedMap, LoadedMap] = {}
 
-    def load(used: UsedMap) -> LoadedMap:
-        if used not in maps:
-            maps[used] = _loaded(source, used.floor or summary.site, used, manifest_sha256)
-        return maps[used]
+    mounted = (MountedCamera(record.camera, record.body_from_cam), *record.others)
+    localizer = Localizer(MountedRig(RigCalibration((), None, record.base_from_body), mounted), record.settings)
 
-    now = replay_failure(record, load)
-    versions = [loaded.version for loaded in maps.values()]
-    return Comparison(summary, versions[0] if versions else None, now)
+    def show(used: UsedMap | None) -> None:
+        if used is not None:
+            if used not in maps:
+                maps[used] = _loaded(source, used.floor or summary.site, used, manifest_sha256)
+            maps[used].show(localizer, used.floor)
+
+    show(record.used)
+    localizer.begin(record.start)
+    now = []
+    for commands, percept in record.frames:
+        show(commands.used)
+        if commands.forgets:
+            localizer.forget_pose()
+        for prior in commands.priors:
+            localizer.handle_prior(prior)
+        now.append(moment_of(localizer.localize(percept)))
+    version = next((loaded.version for loaded in maps.values()), None)
+    return Comparison(summary, version, now)
 
 
 def _loaded(source: MapSource, site: str, used: UsedMap, other_sha256: str | None) -> LoadedMap:

@@ -1,9 +1,9 @@
 """Picture of a replay, drawn by OpenCV: path and landmarks, coloured by error; errors and statuses over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -34,8 +34,7 @@ _MAX_LANDMARKS = 40_000
 _SHIFT = 4  # fractional bits of a coordinate
 
 
-@dataclass(frozen=True)
-class RunPlot:
+class RunPlot(NamedTuple):
     """Data of the picture: positions_map_m, truths_map_m (N, 3), NaN if unknown, of N frames; landmarks_map_m (M, 3)."""
 
     title: str
@@ -159,8 +158,7 @@ def _by_error(share: float) -> Colour:
     return int(blue), int(green), int(red)
 
 
-@dataclass(frozen=True)
-class _Axes:
+class _Axes(NamedTuple):
     """A rectangle of the picture from low (top left) to high, in pixels, that shows values from data_low to data_high, each (2,)."""
 
     picture: Picture

@@ -1,8 +1,8 @@
 """Metrics of a run: localized share, times, errors, failures. Pure. To add one: a function here and a line in METRICS."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from fleetmap.messages import Status
 WARM_UP_FRAMES = 20
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRecord:
+class FrameRecord(NamedTuple):
     """One frame of a run.
 
     Errors are unaligned against the truth in the map's frame, None if either is unknown; error_map_m (3,) is estimate minus

@@ -1,14 +1,13 @@
 """Published frame `odom`: continuous from the first localized pose on. Pure."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fleetmap.geometry import Array, se3_inverse, transport_cov
 from fleetmap.odometry.estimate import ContinuousFrame
 from locclient.localization.estimate import Estimate
 
 
-@dataclass(frozen=True, slots=True)
-class PublishedPose:
+class PublishedPose(NamedTuple):
     """One estimate in the published frames; map_from_odom is None while there is no single pose.
 
     building_from_map: of the robot's map, None if the map does not define it. cov_rot_trans (6, 6): of map_from_base, map axes, about

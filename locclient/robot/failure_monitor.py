@@ -1,7 +1,7 @@
 """Detection of position failures and their causes, from successive estimates. Pure; `fleetmap.failure_definition` has the limits."""
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fleetmap.failure_definition import (
     BLIND_S,
@@ -24,8 +24,7 @@ _MAX_REFUSED_CHARS = 500
 CONTRADICTING_LOOKS = 3  # one refused fix is chance, several in a row are a doubt
 
 
-@dataclass(frozen=True, slots=True)
-class Failure:
+class Failure(NamedTuple):
     """A failure, reported once.
 
     stamp_ns: of its first frame. estimate: of the frame of its detection, or the last one before frames were missing.

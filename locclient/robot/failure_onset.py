@@ -2,8 +2,8 @@
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from math import dist
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,8 +25,7 @@ _RECENT_FIX_NS = 2_000_000_000
 _DROPPED_STEPS = 1.5  # shortest steps between frames; frames are missing in a longer one
 
 
-@dataclass(frozen=True, slots=True)
-class Belief:
+class Belief(NamedTuple):
     """The last claimed pose of a robot: map_from_body (4, 4), cov_rot_trans (6, 6).
 
     odom_from_body (4, 4) of the same frame, in an odometry frame that is never redefined. fix_ns: stamp of the last fix until then;
@@ -43,15 +42,14 @@ class Belief:
     def carried_on(self, odom_from_body: Array) -> "Belief":
         """Return the belief with its pose propagated by odometry, and its covariance as it was."""
         map_from_body = self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
-        return replace(self, map_from_body=map_from_body, odom_from_body=odom_from_body)
+        return self._replace(map_from_body=map_from_body, odom_from_body=odom_from_body)
 
     def off_m(self, map_from_body: Array, odom_from_body: Array) -> float:
         """Return the distance of a pose from the belief, carried on."""
         return dist(map_from_body[:3, 3], self.carried_on(odom_from_body).map_from_body[:3, 3])
 
 
-@dataclass(frozen=True, slots=True)
-class Onset:
+class Onset(NamedTuple):
     """The first frame of a failure. left: its left image, of the view compared with the map; pictures: stamps, small images, oldest first.
 
     belief: carried on to this frame; None if the robot had claimed no pose.
@@ -64,8 +62,7 @@ class Onset:
     view: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
+class Evidence(NamedTuple):
     """Evidence for a cause when a failure is detected.
 
     wrong_by_m: distance from the belief to the place of agreeing fixes, None without such fixes. broke: the odometry lost all tracks

@@ -1,7 +1,7 @@
 """Failure report: context in numbers and small images. Pure; the caller provides id and wall clock."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -103,8 +103,7 @@ def _at(pixel: Array) -> tuple[int, int]:
 _MATCHES_WIDTH_PX = 800
 
 
-@dataclass(frozen=True)
-class RobotProfile:
+class RobotProfile(NamedTuple):
     """Common data of all reports of a robot: site, name, rig, settings, and the privacy of its pictures: full, blurred or off (none)."""
 
     site: str

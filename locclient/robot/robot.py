@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
@@ -37,8 +37,7 @@ Clock = Callable[[], float]  # seconds
 _MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
 
 
-@dataclass(frozen=True, slots=True)
-class FailureContext:
+class FailureContext(NamedTuple):
     """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
     unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
@@ -186,7 +185,7 @@ class Robot:
             if self.ring is not None and self.running is not None:  # recordings of failures need the map
                 self.ring.use(self.running, self._site)
         level = self.building[self._site].entry.level if self.building else ""
-        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
+        published = self._odom.handle(estimate)._replace(building_from_map=self._building_from_map(), level=level)
         odom_from_body = published.odom_from_base @ self.base_from_body
         if estimate.is_at_home:
             self.versions.handle(estimate, odom_from_body)
@@ -220,8 +219,7 @@ class Robot:
         self.localizer.handle_imu(bundle.imu)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
-        is_bad = self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault
-        wheel = [] if is_bad else bundle.wheel
+        wheel = [] if self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault else bundle.wheel
         self.localizer.handle_wheel(wheel)
         if self.ring is not None:
             self.ring.handle_samples(replace(bundle, wheel=wheel))
@@ -263,11 +261,11 @@ class Robot:
         evidence = Evidence()
         if odom_from_body is not None:
             evidence = self._onsets.evidence(failure.estimate, failure.kind, began_ns, odom_from_body)
-        failure = replace(failure, cause=refined_cause(failure.cause, evidence))
+        failure = failure._replace(cause=refined_cause(failure.cause, evidence))
         was_carried = failure.cause is Cause.CARRIED
         onset = self._onsets.onset(failure.kind, began_ns, frame, was_carried=was_carried)
         lasted_s = failure.duration_s + max(0, began_ns - onset.stamp_ns) * 1e-9
-        failure = replace(failure, stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
+        failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.search or onset
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut)

@@ -1,8 +1,8 @@
 """Trial of a new map version before it replaces the one that a robot runs. Pure."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ class Change(StrEnum):
     POSTPONED = "postponed"
 
 
-@dataclass(frozen=True, slots=True)
-class VersionChange:
+class VersionChange(NamedTuple):
     """A version that was adopted, refused for good, or postponed because of unusable images; reason: text."""
 
     wanted: WantedVersion

@@ -225,8 +225,7 @@ def _state(looks: Sequence[CameraView], value: Array, sigma: Array) -> Calibrati
 
 def _tilt_in_doubt(looks: Sequence[CameraView], value: Array, sigma: Array) -> float:
     """Return the camera rotation about the body's x or y, rad, by gravity if the map is level; 0 if turns of the robot exclude it."""
-    information = sum((look.information[TILT, TILT] for look in looks), 1e-9 * np.eye(2))
-    covariance = np.linalg.inv(information)
+    covariance = np.linalg.inv(sum((look.information[TILT, TILT] for look in looks), 1e-9 * np.eye(2)))
     in_level_map = np.abs(covariance @ sum(look.score[TILT] for look in looks))
     least, limit = np.array([(PARAMETERS[k].least_sigma, PARAMETERS[k].limit) for k in range(TILT.start, TILT.stop)]).T
     common = least * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(looks))

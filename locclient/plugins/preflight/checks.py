@@ -3,9 +3,9 @@
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from fleetmap.bus.endpoints import handshake_fault
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError
@@ -37,8 +37,7 @@ _MIN_FRAME_HZ, _MIN_IMU_HZ = 5.0, 90.0
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """Result of a check. level: ok, warn or fail; text: the result and, unless ok, the next step."""
 
     level: str

@@ -6,10 +6,9 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import rclpy
@@ -67,8 +66,7 @@ def faults_logged(what: str) -> Iterator[None]:
         _limit.warning(what, "%s: %s", what, error)
 
 
-@dataclass(frozen=True)
-class Feed:
+class Feed(NamedTuple):
     """One of several topics with their classes of messages, in order of preference, and what takes the class and bytes (CDR) of each.
 
     is_awaited: whether it is a fault that nobody publishes.

@@ -67,13 +67,10 @@ class UvcSource:
         """Read frames until the camera is gone or a stop is requested."""
         if not capture.isOpened():
             return
-        for prop, value in (
-            (cv2.CAP_PROP_FRAME_WIDTH, self._section.width_px),
-            (cv2.CAP_PROP_FRAME_HEIGHT, self._section.height_px),
-            (cv2.CAP_PROP_FPS, self._section.rate_hz),
-            (cv2.CAP_PROP_BUFFERSIZE, 1),  # with several, the oldest would come first
-        ):
-            capture.set(prop, value)
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._section.width_px)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._section.height_px)
+        capture.set(cv2.CAP_PROP_FPS, self._section.rate_hz)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # with several, the oldest would come first
         while not wait(0.0):
             is_open, picture = capture.read()
             if not is_open:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -271,7 +270,7 @@ class FleetAdapter:
     def silence(self) -> None:
         """Handle missing frames."""
         with self._lock:
-            self._see(replace(self._localization, is_silent=True))
+            self._see(self._localization._replace(is_silent=True))
             self._judge_position()
 
     def _see(self, localization: Localization) -> None:

@@ -10,10 +10,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from fleetmap.bus.endpoints import is_loopback_name
@@ -35,8 +34,7 @@ _no_room = partial(RefusedActionError, "INSUFFICIENT_MEMORY", level="URGENT")
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Origins:
+class Origins(NamedTuple):
     """Allowed servers of files. token: bearer token sent to them; ca: file of authorities, None for the machine's."""
 
     allowed: Sequence[str]
@@ -157,8 +155,7 @@ class FleetMaps:
 
     def versions(self) -> list[tuple[int, bool]]:
         """Return the versions on the disk, oldest first, each with True if enabled."""
-        active = self._cache.active(self._site)
-        return [(record.version, record == active) for record in self._cache.kept(self._site)]
+        return [(kept.version, kept == self._cache.active(self._site)) for kept in self._cache.kept(self._site)]
 
     def download(self, version: int, link: str, sha256: str | None) -> None:
         """Fetch a version's file, check it by the signed list, and keep the version. Other versions are not affected.

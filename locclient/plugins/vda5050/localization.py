@@ -1,7 +1,7 @@
 """Localization in VDA 5050 terms, from a robot's estimates: position and LOCALIZATION_ERROR. Pure."""
 
-from dataclasses import dataclass
 from math import atan2, hypot, pi
+from typing import NamedTuple
 
 from fleetmap.failure_definition import is_driving, radius_95_m
 from fleetmap.geometry import Array
@@ -31,8 +31,7 @@ _STATUS_WORDS = {
 }
 
 
-@dataclass(frozen=True)
-class Position:
+class Position(NamedTuple):
     """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized. site: another one
     of the robot's building, whose map it is in; empty for its own.
     """
@@ -51,8 +50,7 @@ class Position:
         return hypot(self.x_m - other.x_m, self.y_m - other.y_m), min(turn, 2 * pi - turn)
 
 
-@dataclass(frozen=True)
-class Localization:
+class Localization(NamedTuple):
     """The last estimate, None before the first. position: the last known one, also if the robot is not localized."""
 
     estimate: Estimate | None = None

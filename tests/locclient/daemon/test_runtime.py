@@ -261,7 +261,7 @@ def test_the_recording_of_a_failure_at_the_end_has_arrived(
     bundles = list(robot_world.bundles(110, dark=range(60, 110)))
     plain = world.parts(ScriptedSource(bundles, ready=lambda: robot.running is not None), robot, Listener())
     spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
-    made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
+    made = Runtime(plain._replace(replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
 
     sent = plain.server.client.deliver
 

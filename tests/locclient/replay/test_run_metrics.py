@@ -1,7 +1,6 @@
 """What a run was worth, against sequences small enough to judge by hand, and its picture, with colours that say what happened."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -257,7 +256,7 @@ def plot(**about: object) -> RunPlot:
         for k in range(FRAMES)
     ]
     walls = np.column_stack([np.tile(x, 2), np.repeat([-2.0, 2.0], FRAMES), np.ones(2 * FRAMES)])
-    return replace(RunPlot("hall, version 3", frames, truths + error, truths, walls), **about)
+    return RunPlot("hall, version 3", frames, truths + error, truths, walls)._replace(**about)
 
 
 def count(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> int:
@@ -276,11 +275,11 @@ def test_large_errors_and_frames_that_are_not_localised_stand_out() -> None:
     run = plot()
     frames, places = list(run.frames), run.positions_map_m.copy()
     for k in range(10, 20):
-        frames[k] = replace(frames[k], error_map_m=np.array([0.0, 0.8, 0.0]))
+        frames[k] = frames[k]._replace(error_map_m=np.array([0.0, 0.8, 0.0]))
     for k in range(30, 40):
-        frames[k] = replace(frames[k], status=Status.AMBIGUOUS)
-    frames[50], places[50] = replace(frames[50], status=Status.LOST, error_map_m=None, cov_rot_trans=None), np.nan
-    picture = draw_run(replace(run, frames=frames, positions_map_m=places))
+        frames[k] = frames[k]._replace(status=Status.AMBIGUOUS)
+    frames[50], places[50] = frames[50]._replace(status=Status.LOST, error_map_m=None, cov_rot_trans=None), np.nan
+    picture = draw_run(run._replace(frames=frames, positions_map_m=places))
     assert count(picture, RED) > 1000
     assert count(picture, VIOLET) > 500
 
@@ -290,11 +289,11 @@ def test_large_errors_and_frames_that_are_not_localised_stand_out() -> None:
 def test_runs_without_truth_or_pose_are_drawn(frames: int, landmarks: int) -> None:
     run, nowhere = plot(), np.full((frames, 3), np.nan)
     lost = [
-        replace(frame, status=Status.LOST, has_fix=False, cov_rot_trans=None, error_map_m=None, error_rad=None)
+        frame._replace(status=Status.LOST, has_fix=False, cov_rot_trans=None, error_map_m=None, error_rad=None)
         for frame in run.frames[:frames]
     ]
     assert draw_run(RunPlot("x", lost, nowhere, nowhere, run.landmarks_map_m[:landmarks])).shape[1] == 2040
-    untold = [replace(frame, error_map_m=None, error_rad=None) for frame in run.frames[:frames]]
+    untold = [frame._replace(error_map_m=None, error_rad=None) for frame in run.frames[:frames]]
     shown = RunPlot("x", untold, run.positions_map_m[:frames], nowhere, run.landmarks_map_m[:landmarks])
     assert draw_run(shown).shape[1] == 2040
 

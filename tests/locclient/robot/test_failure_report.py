@@ -95,9 +95,9 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
     map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
     np.testing.assert_allclose(map_from_cam, told[0].onset.belief.map_from_body @ rig.body_from_cam, atol=1e-9)
-    belief = replace(told[0].onset.belief, floor="hall-2")
-    onset = replace(told[0].onset, belief=belief)
-    other = failure_report(replace(told[0], onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
+    belief = told[0].onset.belief._replace(floor="hall-2")
+    onset = told[0].onset._replace(belief=belief)
+    other = failure_report(told[0]._replace(onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
     assert (other.map_from_base, other.tile, other.landmarks_expected) == (None, None, None), "no place on this site"
     assert report.camera.size_px == (rig.camera.width_px, rig.camera.height_px)
     lens = rig.camera.cx_px, rig.camera.cy_px, rig.camera.focal_px
@@ -105,9 +105,9 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert len(encode_message(report.camera)) < 256
     assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
     left = frame(60).left
-    bright = replace(told[0], unmatched=replace(told[0].unmatched, left=left))
+    bright = told[0]._replace(unmatched=told[0].unmatched._replace(left=left))
     sharp, blurred = (
-        failure_report(bright, replace(profile, pictures=seen), report_id="ab" * 16, wall_ns=7).thumbnails
+        failure_report(bright, profile._replace(pictures=seen), report_id="ab" * 16, wall_ns=7).thumbnails
         for seen in ("full", "blurred")
     )
     assert [each.stamp_ns for each in blurred] == [each.stamp_ns for each in sharp]
@@ -116,7 +116,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert is_like(sharp[3].jpeg, left, without_detail(left))
     assert is_like(blurred[3].jpeg, without_detail(left), left)
     assert LocclientConfig().run.replays == profile.pictures == "blurred", "unless somebody asks for more"
-    unseen = failure_report(bright, replace(profile, pictures="off"), report_id="ab" * 16, wall_ns=7)
+    unseen = failure_report(bright, profile._replace(pictures="off"), report_id="ab" * 16, wall_ns=7)
     assert b"\xff\xd8\xff" not in encode_message(unseen), "the beginning of a JPEG"
     assert (unseen.thumbnails, unseen.landmarks_expected) == ((), report.landmarks_expected)
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())

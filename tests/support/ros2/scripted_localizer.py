@@ -52,7 +52,7 @@ def main() -> None:
     word = ""
     while word != "down":
         told = replace(estimate(time.time()), floor="hall_2")
-        published = replace(odom.handle(told), building_from_map=BUILDING_FROM_MAP, level="2")
+        published = odom.handle(told)._replace(building_from_map=BUILDING_FROM_MAP, level="2")
         for localizer in localizers:
             localizer.publish(told, published, np.eye(4))
             localizer.alive(False)
