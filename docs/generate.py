@@ -22,7 +22,6 @@ import typer  # noqa: E402
 from fleetmap.config import Section, Tiers, settings_in, tier_of  # noqa: E402
 from fleetmap.hooks import plugins  # noqa: E402
 from locclient.config import with_plugins  # noqa: E402
-from locclient.hooks import link_hooks, prior_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
 from mapserver.config import MapserverConfig  # noqa: E402
 
@@ -132,12 +131,13 @@ def command_page(page: str, plugin: str | None = None) -> str:
 
 def settings_page(page: str, plugin: str | None = None) -> str:
     """docs/settings.md as it should be, or a plug-in's page; ValueError where it lacks a section or has one that is gone."""
+    of_plugins = plugins("locclient.links") | plugins("locclient.priors")
     wanted = {
         (tier, program, setting.section)
         for program, (config, tiers) in PROGRAMS.items()
         for setting in settings_in(config)
         if (tier := tier_of(setting, tiers)) is not None
-        and (setting.section == plugin if plugin else setting.section not in link_hooks() | prior_hooks())
+        and (setting.section == plugin if plugin else setting.section not in of_plugins)
     }
     seen = set()
     parts, tier = re.split(r"^(?=###? )", page, flags=re.MULTILINE), ""

@@ -8,10 +8,11 @@ import msgspec
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, Tiers, read_given, refuse_internal
 from fleetmap.geometry import Array
+from fleetmap.hooks import plugins
 from fleetmap.recordings import Topics
 from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.sensors.source_settings import SourceSection
-from locclient.hooks import LinkHook, link_hooks, prior_hooks
+from locclient.hooks import LinkHook
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
@@ -104,7 +105,8 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
 
 def with_plugins() -> tuple[LocclientConfig, Tiers]:
     """Return the defaults of the whole file, with the sections of the installed plug-ins, and the tiers of its keys."""
-    sections = [(name, hook.section, hook.section()) for name, hook in (link_hooks() | prior_hooks()).items()]
+    hooks = plugins("locclient.links") | plugins("locclient.priors")
+    sections = [(name, hook.section, hook.section()) for name, hook in hooks.items()]
     kind: type[LocclientConfig] = msgspec.defstruct(  # type: ignore[assignment]
         "Config", sections, bases=(LocclientConfig,), frozen=True, kw_only=True
     )
@@ -113,13 +115,13 @@ def with_plugins() -> tuple[LocclientConfig, Tiers]:
 
 def links_of(config: LocclientConfig) -> list[tuple[LinkHook, Section]]:
     """Return the links that the file asks for, with their sections."""
-    sections = ((hook, getattr(config, name, None)) for name, hook in link_hooks().items())
+    sections = ((hook, getattr(config, name, None)) for name, hook in plugins("locclient.links").items())
     return [(hook, section) for hook, section in sections if section is not None and hook.is_on(section)]
 
 
 def image_priors_of(config: LocclientConfig, mounted: MountedCamera, base_from_body: Array) -> list[ImagePriors]:
     """Open the priors by images that the file asks for; UsageError for invalid settings."""
-    sections = ((hook, getattr(config, name, None)) for name, hook in prior_hooks().items())
+    sections = ((hook, getattr(config, name, None)) for name, hook in plugins("locclient.priors").items())
     opened = (hook.open(section, mounted, base_from_body) for hook, section in sections if section is not None)
     return [prior for prior in opened if prior is not None]
 

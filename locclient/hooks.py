@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fleetmap.config import Section
-from fleetmap.hooks import plugins
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.samples import PositionPrior
@@ -98,13 +97,3 @@ class PriorHook(NamedTuple):
 
     section: type[Section]
     open: "Callable[[Any, MountedCamera, Array], ImagePriors | None]"
-
-
-def prior_hooks() -> dict[str, PriorHook]:
-    """Return the installed priors by their sections' names."""
-    return plugins("locclient.priors")
-
-
-def link_hooks() -> dict[str, LinkHook]:
-    """Return the installed links by their sections' names."""
-    return plugins("locclient.links")

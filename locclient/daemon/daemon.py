@@ -41,10 +41,7 @@ _log = logging.getLogger(__name__)
 def check_run(config: LocclientConfig) -> MapAddress:
     """Check the configuration and return the map's address; UsageError names missing or contradicting settings of [run]."""
     run, links = config.run, links_of(config)
-    try:
-        address = MapAddress.of(run, may_be_alone=bool(links))
-    except UsageError as error:
-        raise UsageError(f"[run] {error}") from error
+    address = MapAddress.of(run, sign="[run] ", may_be_alone=bool(links))
     try:
         check_reach(config.output.endpoint, insecure=run.insecure)
     except UsageError as error:

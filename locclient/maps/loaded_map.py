@@ -1,6 +1,7 @@
 """Tiles of one map version in memory, and their selection: those within reach, and those ahead. Pure."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,13 +28,12 @@ class TileSelectionSettings(Section, frozen=True):
     most_mps: float = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class PositionBound:
+class PositionBound(NamedTuple):
     """Bound of the robot's position: within radius_m of that of the last estimate with a pose (3,), at stamp_ns, None for anywhere; with
     its velocity (3,)."""
 
     position_map_m: Array | None = None
-    velocity_map_mps: Array = field(default_factory=lambda: np.zeros(3))
+    velocity_map_mps: Array = np.zeros(3)
     radius_m: float = 0.0
     stamp_ns: int = 0
 

@@ -131,7 +131,6 @@ class MapClient(MapSource):
         super().__init__(site)
         self.bus, self.cache = bus, cache
         self.robot = check_name(robot, "robot")
-        self._timeout_s = timeout_s
         self.chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self.trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
@@ -140,18 +139,11 @@ class MapClient(MapSource):
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._begun = ""  # the manifest's address of the version that was admitted last
 
-    def check_admitted(self, wanted: WantedVersion) -> None:
-        """Fetch the signed lists, and raise UntrustedError or UnreachableError unless they admit this version now."""
-        if self.trust is None:
-            raise UntrustedError("signature", "this robot has no signed lists; it needs a server, not a folder")
-        self.trust.refresh()
-        self.trust.admitted(wanted)
-
     # --- versions -----------------------------------------------------------------------------------------------------
 
     def wanted(self) -> WantedVersion:
         """Return the version that the server wants this robot to run; LinkError without an answer."""
-        wanted = decode_message(self.bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
+        wanted = decode_message(self.bus.get(self._key("wanted"), timeout_s=self.chunks.timeout_s), WantedVersion)
         if wanted.site != self.site:
             raise LinkError(f"requested site {self.site}, the server answered for {wanted.site[:80]!r}")
         if self.trust is not None:
@@ -312,7 +304,7 @@ class MapClient(MapSource):
     def deliver(self, name: str, payload: bytes) -> FailureAck:
         """Send an encoded FailureReport to `failures`, or a ReplayPart to `replays`, and return the server's answer, once stored on its
         disk; errors as of `wanted`."""
-        return decode_message(self.bus.get(self._key(name), payload, timeout_s=self._timeout_s), FailureAck)
+        return decode_message(self.bus.get(self._key(name), payload, timeout_s=self.chunks.timeout_s), FailureAck)
 
     def publish(self, name: str, message: msgspec.Struct, *, may_drop: bool = False) -> None:
         """Publish a message of the robot; may_drop: on a congested network, where the next one replaces it."""

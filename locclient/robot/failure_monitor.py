@@ -83,9 +83,17 @@ class FailureMonitor:
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
         blind = self._had_fix and is_blind(estimate.status, radius_m) and estimate.cause is not Cause.RIDING
-        self._follow(now_ns, blind, self._contradicting_looks >= CONTRADICTING_LOOKS)
+        doubted = self._contradicting_looks >= CONTRADICTING_LOOKS
+        is_good = estimate.status is Status.TRACKING and not (blind or doubted)
+        self._blind_ns = _since(self._blind_ns, now_ns, holds=blind)
+        self._doubted_ns = _since(self._doubted_ns, now_ns, holds=doubted)
+        self._good_ns = _since(self._good_ns, now_ns, holds=is_good)
+        if self._good_ns is not None and (now_ns - self._good_ns) * 1e-9 >= GOOD_S:
+            self.is_running = False
         if blind:
             self._causes[failure_cause(estimate)] += 1
+        else:
+            self._causes.clear()
         if self.is_running:
             return None
         if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > BLIND_S:
@@ -143,27 +151,15 @@ class FailureMonitor:
         contradicts = fix is None and estimate.innovation is not None and estimate.status is Status.TRACKING
         self._contradicting_looks = self._contradicting_looks + 1 if contradicts else 0
 
-    def _follow(self, now_ns: int, blind: bool, doubted: bool) -> None:
-        if not blind:
-            self._blind_ns = None
-            self._causes.clear()
-        elif self._blind_ns is None:
-            self._blind_ns = now_ns
-        if not self._contradicting_looks:
-            self._doubted_ns = None
-        elif doubted and self._doubted_ns is None:
-            self._doubted_ns = now_ns
-        if blind or doubted or self._last is None or self._last.status is not Status.TRACKING:
-            self._good_ns = None
-        elif self._good_ns is None:
-            self._good_ns = now_ns
-        elif (now_ns - self._good_ns) * 1e-9 >= GOOD_S:
-            self.is_running = False
-
     def _detected(self, kind: FailureKind, cause: Cause, began_ns: int, now_ns: int) -> Failure:
         assert self._last is not None
         self.is_running = True
         return Failure(kind, cause, began_ns, (now_ns - began_ns) * 1e-9, self._last, tuple(self._fixes))
+
+
+def _since(before_ns: int | None, now_ns: int, *, holds: bool) -> int | None:
+    """Return the stamp since when a condition holds, None if it does not. before_ns: the same at the frame before."""
+    return None if not holds else now_ns if before_ns is None else before_ns
 
 
 def failure_cause(estimate: Estimate) -> Cause:

@@ -205,8 +205,10 @@ class FleetMaps:
         return wanted
 
     def _check_admitted(self, wanted: WantedVersion) -> None:
+        """Fetch the signed lists of a map server, and raise UntrustedError or UnreachableError unless they admit this version now."""
         if self._client.trust is not None:
-            self._client.check_admitted(wanted)
+            self._client.trust.refresh()
+            self._client.trust.admitted(wanted)
 
     def delete(self, version: int, in_use: set[int]) -> None:
         """Remove a version; StateError if it is enabled, in use or absent."""

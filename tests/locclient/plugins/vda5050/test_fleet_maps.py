@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -62,10 +63,11 @@ class Robot:
         self.asked: list[WantedVersion] = []
         self.fault: FleetmapError | None = None
         self.cache = TileCache(folder / "cache", max_bytes=max_bytes)
-        self.folder, self.site, self.trust = self.cache.folder / "incoming", "lab", "signed lists"
+        self.folder, self.site = self.cache.folder / "incoming", "lab"
+        self.trust = SimpleNamespace(refresh=lambda: None, admitted=self._check)
         self.maps = FleetMaps(self, Origins(allowed))  # type: ignore[arg-type]
 
-    def check_admitted(self, wanted: WantedVersion) -> None:
+    def _check(self, wanted: WantedVersion) -> None:
         self.asked.append(wanted)
         if self.fault is not None:
             raise self.fault
