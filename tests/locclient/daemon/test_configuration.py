@@ -20,7 +20,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def _read(file: Path) -> tuple[LocclientConfig, dict[str, dict[str, object]]]:
-    return typer.main.get_command(cli.app).context_settings["obj"].read_config(file)
+    return typer.main.get_command(cli.app).context_settings["obj"](file)
 
 
 def test_site_and_server_are_said_once_and_old_keys_are_refused(tmp_path: Path) -> None:
