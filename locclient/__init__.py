@@ -28,44 +28,31 @@ from typing import TYPE_CHECKING
 from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from fleetmap.relocalization.map_view import MapView
-    from fleetmap.relocalization.relocalizer import Fix, Relocalizer
-    from fleetmap.time_sliced import finished
-    from fleetmap.version import __version__
-    from locclient.localization.estimate import Estimate
-    from locclient.localization.localizer import Localizer
-    from locclient.localization.settings import LocalizerSettings
-    from locclient.replay.replay import LocalizeOptions, fetch_map, localize
-    from locclient.replay.run_result import ReplayResult
-    from locclient.robot.robot import Robot
+    from fleetmap.relocalization.map_view import MapView as MapView
+    from fleetmap.relocalization.relocalizer import Fix as Fix
+    from fleetmap.relocalization.relocalizer import Relocalizer as Relocalizer
+    from fleetmap.time_sliced import finished as finished
+    from fleetmap.version import __version__ as __version__
+    from locclient.localization.estimate import Estimate as Estimate
+    from locclient.localization.localizer import Localizer as Localizer
+    from locclient.localization.settings import LocalizerSettings as LocalizerSettings
+    from locclient.replay.replay import LocalizeOptions as LocalizeOptions
+    from locclient.replay.replay import fetch_map as fetch_map
+    from locclient.replay.replay import localize as localize
+    from locclient.replay.run_result import ReplayResult as ReplayResult
+    from locclient.robot.robot import Robot as Robot
 
-__all__ = [
-    "Estimate",
-    "Fix",
-    "LocalizeOptions",
-    "Localizer",
-    "LocalizerSettings",
-    "MapView",
-    "Relocalizer",
-    "ReplayResult",
-    "Robot",
-    "__version__",
-    "fetch_map",
-    "finished",
-    "localize",
-]
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "fleetmap.version": "__version__",
-        "fleetmap.time_sliced": "finished",
-        "fleetmap.relocalization.map_view": "MapView",
-        "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
-        "locclient.localization.estimate": "Estimate",
-        "locclient.localization.localizer": "Localizer",
-        "locclient.localization.settings": "LocalizerSettings",
-        "locclient.replay.replay": "LocalizeOptions fetch_map localize",
-        "locclient.replay.run_result": "ReplayResult",
-        "locclient.robot.robot": "Robot",
-    },
-)
+_NAMES = {
+    "fleetmap.version": "__version__",
+    "fleetmap.time_sliced": "finished",
+    "fleetmap.relocalization.map_view": "MapView",
+    "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
+    "locclient.localization.estimate": "Estimate",
+    "locclient.localization.localizer": "Localizer",
+    "locclient.localization.settings": "LocalizerSettings",
+    "locclient.replay.replay": "LocalizeOptions fetch_map localize",
+    "locclient.replay.run_result": "ReplayResult",
+    "locclient.robot.robot": "Robot",
+}
+__all__ = [name for names in _NAMES.values() for name in names.split()]
+__getattr__, __dir__ = lazy_names(__name__, _NAMES)

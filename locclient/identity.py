@@ -191,13 +191,13 @@ class MapAddress:
         usual = {"site": given.site or None, "robot": given.robot or usual_robot or None}
 
         def named(what: str) -> str:
-            enrolled: str | None = usual[what] if identity is None else getattr(identity.who, what)
-            if enrolled is None:
+            name: str | None = usual[what] if identity is None else getattr(identity.who, what)
+            if name is None:
                 raise UsageError(f"{sign}{what} is missing: which site's map, and who asks?")
-            if identity is not None and getattr(given, what) not in {None, enrolled}:
+            if identity is not None and getattr(given, what) not in {None, name}:
                 asked = f"{what} {getattr(given, what)} is asked for"
-                raise UsageError(f"{asked}, but {identity.folder} is enrolled as {what} {enrolled}")
-            return check_name(enrolled, what)
+                raise UsageError(f"{asked}, but {identity.folder} is enrolled as {what} {name}")
+            return check_name(name, what)
 
         if identity is None:
             named("site")  # first error of an empty configuration

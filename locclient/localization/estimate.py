@@ -126,7 +126,7 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
     elsewhere, settings = tracker.candidates.hypotheses, tracker.settings
     is_known = not np.isnan(confirmed.now.map_from_body).any()
     radius_m = radius_95_m(confirmed.now.cov_rot_trans) if is_known else float("inf")
-    age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
+    is_late = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9 > settings.degraded_after_s
     is_broken = confirmed.has_broken or confirmed.lost_imu
     cause = _cause(estimate, has_failed=has_failed) or (Cause.ODOMETRY if is_broken else Cause.NONE)
     told = [h for h in elsewhere if h.speaks_against_others(settings)]
@@ -135,12 +135,7 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
     is_doubted = is_broken or (confirmed.missed and is_moved)
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
-    elif (
-        radius_m > settings.degraded_radius_m
-        or age_s > settings.degraded_after_s
-        or cause is Cause.FROZEN
-        or is_doubted
-    ):
+    elif radius_m > settings.degraded_radius_m or is_late or cause is Cause.FROZEN or is_doubted:
         status = Status.DEGRADED
     else:
         status, cause = Status.TRACKING, Cause.NONE

@@ -136,11 +136,8 @@ class PoseHypothesis:
         motion = motions.get(self.frame_index)
         if motion is None:
             # The odometry dropped the start frame in a long standstill, or restarted: one step by its estimates alone.
-            is_sure = (
-                odometry.new_odom_from_old_odom is None
-                and odometry.status is not OdometryStatus.DEGRADED
-                and odometry.scale_known
-            )
+            is_lost = odometry.status is OdometryStatus.DEGRADED or odometry.new_odom_from_old_odom is not None
+            is_sure = odometry.scale_known and not is_lost
             self.now = self.now.moved(step, step_cov(MEASURED_DRIFT if is_sure else RESTARTED, step_m))
         else:
             distance_m = length(motion.body_from_now[:3, 3])

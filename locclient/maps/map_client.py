@@ -39,16 +39,7 @@ from fleetmap.messages import (
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from fleetmap.version_grid import grid_blobs
 from locclient.identity import MapAddress
-from locclient.maps.map_source import (
-    CachedMap,
-    LocalMapSource,
-    MapSource,
-    ReadyVersion,
-    address_of,
-    addresses_of,
-    checked_manifest,
-    checked_tile,
-)
+from locclient.maps import map_source
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES, TileCache
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -117,7 +108,7 @@ class ChunkReader:
 _log = logging.getLogger(__name__)
 
 
-class MapClient(MapSource):
+class MapClient(map_source.MapSource):
     """Fetches maps through a cache, and sends reports.
 
     Cached bytes are not fetched again: a known version can be read while the server is unreachable, and of a new one only the
@@ -161,7 +152,7 @@ class MapClient(MapSource):
         active = self.cache.active(self.site)
         return None if active is None else active.wanted(self.site)
 
-    def ready(self) -> ReadyVersion:
+    def ready(self) -> map_source.ReadyVersion:
         """Return the wanted version, complete and active; else the active one; else the wanted one as far as it can be fetched.
 
         Raises LinkError without an answer and without an active version.
@@ -173,11 +164,11 @@ class MapClient(MapSource):
                 self.bring(wanted)
         except (LinkError, MapFormatError, StoreError) as error:
             if active is not None:
-                return ReadyVersion(active, f"version {active.version} stays active: {error}")
+                return map_source.ReadyVersion(active, f"version {active.version} stays active: {error}")
             if isinstance(error, UnreachableError):
                 raise
-            return ReadyVersion(self.wanted(), str(error))
-        return ReadyVersion(wanted)
+            return map_source.ReadyVersion(self.wanted(), str(error))
+        return map_source.ReadyVersion(wanted)
 
     def newest(self, *, asks: bool = True) -> WantedVersion:
         """Return the version that the site's signed list names as current, fetched and active; else the active one.
@@ -216,11 +207,11 @@ class MapClient(MapSource):
         """
         self._begun = ""
         manifest = self.manifest(wanted)
-        self.cache.reserve(self.site, addresses_of(manifest, wanted.manifest_sha256 or ""))
+        self.cache.reserve(self.site, map_source.addresses_of(manifest, wanted.manifest_sha256 or ""))
         self.vocabulary(manifest)
         for entry in manifest.tiles:
             # Decode to validate, do not keep: a large site exceeds a robot's memory.
-            checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
+            map_source.checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
         if self.takes_grids:
             try:
                 for sha256, size_bytes in grid_blobs(manifest, self.blob).items():
@@ -233,9 +224,9 @@ class MapClient(MapSource):
 
     def activate(self, manifest: Manifest, wanted: WantedVersion) -> None:
         """Make a fetched version the one that the robot starts with; StoreError if a piece of it is missing."""
-        addresses = addresses_of(manifest, wanted.manifest_sha256 or "")
+        addresses = map_source.addresses_of(manifest, wanted.manifest_sha256 or "")
         with suppress(LinkError, MapFormatError):  # of a grid that is not complete in the cache
-            found = grid_blobs(manifest, CachedMap(self.cache, self.site).blob)
+            found = grid_blobs(manifest, map_source.CachedMap(self.cache, self.site).blob)
             addresses += found if all(sha256 in self.cache for sha256 in found) else ()
         self.cache.activate(self.site, manifest.version, addresses)
 
@@ -247,7 +238,7 @@ class MapClient(MapSource):
         Raises LinkError if the site has no version or the server does not answer, UntrustedError if signed lists do not admit it,
         MapFormatError for wrong bytes.
         """
-        version, sha256 = address_of(wanted)
+        version, sha256 = map_source.address_of(wanted)
         active = self.cache.active(self.site)
         is_active = active is not None and sha256 == active.blobs[0]
         max_bytes = MAX_MANIFEST_BYTES
@@ -256,7 +247,7 @@ class MapClient(MapSource):
         if not is_active and self.trust is not None and sha256 != self._begun:
             max_bytes = self.trust.admitted(wanted).length
             self._begun = sha256
-        return checked_manifest(self._blob(self._key(f"manifests/{version}"), sha256, max_bytes), wanted)
+        return map_source.checked_manifest(self._blob(self._key(f"manifests/{version}"), sha256, max_bytes), wanted)
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """Return the verified bytes of an address, from the cache or the server; errors as of `manifest`."""
@@ -349,10 +340,10 @@ def map_client(bus: Bus, cache: TileCache, address: MapAddress, **how: float) ->
 @contextmanager
 def connected(
     address: MapAddress, cache_setting: Path | None = None, cache_bytes: int = DEFAULT_MAX_BYTES
-) -> Iterator[MapSource]:
+) -> Iterator[map_source.MapSource]:
     """Open the maps of an address, with a cache of at most so many bytes; close them afterwards."""
     if address.store is not None:
-        yield LocalMapSource(Path(address.store), address.site, address.version)
+        yield map_source.LocalMapSource(Path(address.store), address.site, address.version)
         return
     cache = TileCache(cache_folder(cache_setting), max_bytes=cache_bytes)
     with open_bus(address) as bus:

@@ -175,16 +175,14 @@ def is_outside_its_bound(frame: FrameRecord, _is_localised: bool = False) -> boo
     return failure_definition.is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
 
 
-def _episodes(
-    frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], longer_than_s: float
-) -> list[tuple[int, int]]:
+def _episodes(frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], over_s: float) -> list[tuple[int, int]]:
     """Return (begin, end) stamps of bad periods longer than so many seconds.
 
     A period lasts until the next frame that is not bad. Periods without 5 s of good tracking between them are one failure.
     """
     good, stamps_ns = localised(frames), [frame.stamp_ns for frame in frames]
     bad = [is_bad(frame, good[k]) for k, frame in enumerate(frames)]
-    long = [(begin, end) for begin, end in _runs(stamps_ns, bad) if end - begin > longer_than_s * 1e9]
+    long = [(begin, end) for begin, end in _runs(stamps_ns, bad) if end - begin > over_s * 1e9]
     return _merged(long, [(stamp_ns, good[k] and not bad[k]) for k, stamp_ns in enumerate(stamps_ns)])
 
 

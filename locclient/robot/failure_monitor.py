@@ -3,19 +3,7 @@
 from collections import Counter, deque
 from typing import NamedTuple
 
-from fleetmap.failure_definition import (
-    BLIND_S,
-    FIND_DRIVING_S,
-    GOOD_S,
-    SILENT_S,
-    SearchClock,
-    is_blind,
-    is_driving,
-    is_found,
-    is_localised,
-    is_wrong,
-    radius_95_m,
-)
+from fleetmap import failure_definition as definition
 from fleetmap.messages import Cause, FailureKind, FixNote, Status
 from locclient.localization.estimate import Estimate
 
@@ -49,7 +37,7 @@ class FailureMonitor:
     def __init__(self) -> None:
         self._fixes: deque[FixNote] = deque(maxlen=_FIX_NOTES)
         self._causes: Counter[Cause] = Counter()  # of frames while blind
-        self._search = SearchClock()
+        self._search = definition.SearchClock()
         self._search_causes: Counter[Cause] = Counter()
         self._had_fix = False
         self._blind_ns: int | None = None
@@ -76,19 +64,19 @@ class FailureMonitor:
         """
         # Of other frames it decides nothing.
         has_say = estimate.status is Status.DEGRADED or estimate.fix is not None
-        radius_m = radius_95_m(estimate.cov_rot_trans) if has_say else float("inf")
-        is_lost = self._is_lost(estimate, radius_m, is_driving(speed_mps), may_be_mapped=may_be_mapped)
+        radius_m = definition.radius_95_m(estimate.cov_rot_trans) if has_say else float("inf")
+        is_lost = self._is_lost(estimate, radius_m, definition.is_driving(speed_mps), may_be_mapped=may_be_mapped)
         self._last, now_ns = estimate, estimate.stamp_ns
         contradicted_ns = self._contradicted_ns or now_ns
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
-        blind = self._had_fix and is_blind(estimate.status, radius_m) and estimate.cause is not Cause.RIDING
+        blind = self._had_fix and definition.is_blind(estimate.status, radius_m) and estimate.cause is not Cause.RIDING
         doubted = self._contradicting_looks >= CONTRADICTING_LOOKS
         is_good = estimate.status is Status.TRACKING and not (blind or doubted)
         self._blind_ns = _since(self._blind_ns, now_ns, holds=blind)
         self._doubted_ns = _since(self._doubted_ns, now_ns, holds=doubted)
         self._good_ns = _since(self._good_ns, now_ns, holds=is_good)
-        if self._good_ns is not None and (now_ns - self._good_ns) * 1e-9 >= GOOD_S:
+        if self._good_ns is not None and (now_ns - self._good_ns) * 1e-9 >= definition.GOOD_S:
             self.is_running = False
         if blind:
             self._causes[failure_cause(estimate)] += 1
@@ -96,20 +84,20 @@ class FailureMonitor:
             self._causes.clear()
         if self.is_running:
             return None
-        if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > BLIND_S:
+        if self._blind_ns is not None and (now_ns - self._blind_ns) * 1e-9 > definition.BLIND_S:
             return self._detected(FailureKind.BLIND, self._causes.most_common(1)[0][0], self._blind_ns, now_ns)
         if is_lost and self._search.began_ns is not None:
             cause = self._search_causes.most_common(1)[0][0]
             return self._detected(FailureKind.NOT_FOUND, cause, self._search.began_ns, now_ns)
-        if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > SILENT_S:
+        if self._doubted_ns is not None and (now_ns - self._doubted_ns) * 1e-9 > definition.SILENT_S:
             return self._detected(FailureKind.SUSPECTED, Cause.FIX_REFUSED, contradicted_ns, now_ns)
-        if estimate.moved_m is not None and is_wrong(estimate.moved_m):
+        if estimate.moved_m is not None and definition.is_wrong(estimate.moved_m):
             return self._detected(FailureKind.SUSPECTED, Cause.MOVED, contradicted_ns, now_ns)
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:
         """Return the failure of a source without frames for so many seconds; None before the first frame."""
-        is_too_long = for_s > BLIND_S if self._had_fix else for_s >= FIND_DRIVING_S
+        is_too_long = for_s > definition.BLIND_S if self._had_fix else for_s >= definition.FIND_DRIVING_S
         if self.is_running or self._last is None or not is_too_long:
             return None
         began_ns = self._last.stamp_ns
@@ -121,8 +109,8 @@ class FailureMonitor:
         """Return True if the robot has had no pose for too long."""
         before_ns = estimate.stamp_ns if self._last is None else self._last.stamp_ns
         has_fix = estimate.fix is not None
-        localised = is_localised(estimate.status, has_fix, radius_m, (estimate.stamp_ns - before_ns) * 1e-9)
-        found = is_found(localised, has_fix, estimate.status, radius_m)
+        localised = definition.is_localised(estimate.status, has_fix, radius_m, (estimate.stamp_ns - before_ns) * 1e-9)
+        found = definition.is_found(localised, has_fix, estimate.status, radius_m)
         if found:
             self._search_causes.clear()
         else:

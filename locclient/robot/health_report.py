@@ -64,10 +64,8 @@ class SearchWay:
         elif is_driving(speed_mps):
             self.metres += abs(speed_mps) * dt_s
         cause = failure_cause(estimate)
-        words = _CAUSE_WORDS.get(
-            cause,
-            f"most pictures look {cause}: see to the camera; if it is well, is the map of this building?",
-        )
+        look = f"most pictures look {cause}: see to the camera; if it is well, is the map of this building?"
+        words = _CAUSE_WORDS.get(cause, look)
         self._causes[words if may_be_mapped else _OFF_MAP_WORDS] += 1
 
     @property

@@ -18,19 +18,11 @@ from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap, tiles_within
+from locclient.robot import motion_checks
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
-from locclient.robot.motion_checks import (
-    DockCheck,
-    ExchangedViews,
-    Load,
-    SpeedGauge,
-    WheelAgreement,
-    accelerometer_refused,
-    imu_refused,
-)
 from locclient.robot.version_trial import TrialSettings, VersionTrials
 
 Clock = Callable[[], float]  # seconds
@@ -113,13 +105,13 @@ class Robot:
         self.versions = VersionTrials(trial, self._show)
         self._odom = ContinuousOdom(calibration.base_from_body)
         self.monitor = FailureMonitor()
-        self._docks = DockCheck(calibration.base_from_body)
+        self._docks = motion_checks.DockCheck(calibration.base_from_body)
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
-        self._speed = SpeedGauge()
-        self._load = Load()
-        self._wheels = WheelAgreement(calibration.base_from_body)
-        self._views = ExchangedViews(calibration, rectifier.mounted)
+        self._speed = motion_checks.SpeedGauge()
+        self._load = motion_checks.Load()
+        self._wheels = motion_checks.WheelAgreement(calibration.base_from_body)
+        self._views = motion_checks.ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
@@ -195,9 +187,8 @@ class Robot:
         rolled = wheel if self._wheels_fault else bundle.wheel
         odometry, percept = self.localizer.perception.odometry, self.localizer.perception.percept
         if isinstance(odometry, WheelOdometry):
-            self._wheels.handle_way(
-                rolled, odometry.wheels.seen_way, self.base_from_body @ self._rectifier.body_from_cam
-            )
+            base_from_cam = self.base_from_body @ self._rectifier.body_from_cam
+            self._wheels.handle_way(rolled, odometry.wheels.seen_way, base_from_cam)
         else:
             self._wheels.handle(rolled, estimate.odometry)
         self._images_refused = self._views.refused(self._wheels, odometry.accelerometer)
@@ -234,8 +225,9 @@ class Robot:
         if self._images_refused:
             return {**self._images_refused, **self._wheels_unused, **self._load.overload}
         wheels = self._wheels.refused or self._wheels_unused
-        imu = imu_refused(odometry.clock.off_s) if odometry.refuses_imu else {}
-        return {**imu, **accelerometer_refused(odometry.accelerometer.fault), **wheels, **self._load.overload}
+        imu = motion_checks.imu_refused(odometry.clock.off_s) if odometry.refuses_imu else {}
+        accelerometer = motion_checks.accelerometer_refused(odometry.accelerometer.fault)
+        return {**imu, **accelerometer, **wheels, **self._load.overload}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """Return the failure of a source without frames for so many seconds."""
