@@ -220,12 +220,12 @@ class MapAddress:
         return cls(site=named("site"), robot=named("robot"), **where, identity=identity, version=given.version)
 
 
-def check_reach(endpoint: str | None, *, insecure: bool) -> None:
-    """Raise UsageError for an endpoint without TLS on another machine, unless `insecure`."""
+def check_reach(endpoint: str | None, *, insecure: bool, sign: str = "") -> None:
+    """Raise UsageError for an endpoint without TLS on another machine, unless `insecure`. sign: before it in the message."""
     if endpoint is None or has_tls(check_endpoint(endpoint)) or is_loopback(endpoint) or insecure:
         return
     raise UsageError(
-        f"{endpoint} is on another machine and without TLS: others on the network can read and answer. Use tls/HOST:PORT, or "
+        f"{sign}{endpoint} is on another machine and without TLS: others on the network can read and answer. Use tls/HOST:PORT, or "
         "--insecure if no other devices are on that network"
     )
 

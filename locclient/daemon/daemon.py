@@ -42,10 +42,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
     """Check the configuration and return the map's address; UsageError names missing or contradicting settings of [run]."""
     run, links = config.run, links_of(config)
     address = MapAddress.of(run, sign="[run] ", may_be_alone=bool(links))
-    try:
-        check_reach(config.output.endpoint, insecure=run.insecure)
-    except UsageError as error:
-        raise UsageError(f"[output] endpoint = {error}") from error
+    check_reach(config.output.endpoint, insecure=run.insecure, sign="[output] endpoint = ")
     output_of(config.output).check(config.output, config.topics)
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
         raise UsageError(

@@ -17,6 +17,7 @@ from locclient.robot.failure_report import RobotProfile
 from locclient.robot.failure_ring import FailureCut
 
 _MAX_PENDING = 4  # each holds some seconds in memory
+_DELIVERED_PER_STEP = 20
 _log = logging.getLogger(__name__)
 
 
@@ -72,9 +73,6 @@ def deliver_replay_part(client: MapClient, outbox: Outbox) -> bool:
         return ack.received_bytes != offset  # else the server accepted nothing
     del outbox.received_bytes[replay.id]
     return True
-
-
-_DELIVERED_PER_STEP = 20
 
 
 def deliver(client: MapClient, outbox: Outbox) -> bool:

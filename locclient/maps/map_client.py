@@ -43,8 +43,11 @@ from locclient.maps import map_source
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES, TileCache
 
 T = TypeVar("T", bound=msgspec.Struct)
+_NOWHERE = "tcp/127.0.0.1:7447"
+_PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a server's restart
 _RETRY_S = 0.2
 _MAX_INCOMPLETE = 8
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -103,9 +106,6 @@ class ChunkReader:
                 if self.clock_s() >= deadline_s:
                     raise
                 time.sleep(_RETRY_S)
-
-
-_log = logging.getLogger(__name__)
 
 
 class MapClient(map_source.MapSource):
@@ -303,10 +303,6 @@ class MapClient(map_source.MapSource):
 
     def _key(self, name: str) -> str:
         return robot_key(self.site, self.robot, name)
-
-
-_NOWHERE = "tcp/127.0.0.1:7447"
-_PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a server's restart
 
 
 def open_bus(address: MapAddress) -> Bus:

@@ -51,9 +51,9 @@ class FailureMonitor:
     @property
     def begun_ns(self) -> dict[FailureKind, int]:
         """Return first stamps of ongoing failures and of conditions that may become one, by kind."""
-        stamps = (self._blind_ns, self._search.began_ns, self._contradicted_ns)
-        kinds = (FailureKind.BLIND, FailureKind.NOT_FOUND, FailureKind.SUSPECTED)
-        return {kind: stamp_ns for kind, stamp_ns in zip(kinds, stamps, strict=True) if stamp_ns is not None}
+        begun_ns = {FailureKind.BLIND: self._blind_ns, FailureKind.NOT_FOUND: self._search.began_ns}
+        begun_ns[FailureKind.SUSPECTED] = self._contradicted_ns
+        return {kind: stamp_ns for kind, stamp_ns in begun_ns.items() if stamp_ns is not None}
 
     def handle(
         self, estimate: Estimate, speed_mps: float | None = None, *, may_be_mapped: bool = True

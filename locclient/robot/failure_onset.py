@@ -88,11 +88,11 @@ def refined_cause(cause: Cause, evidence: Evidence) -> Cause:
 
 
 class OnsetRecorder:
-    """Keeps small pictures of the last seconds, and the onset of every ongoing condition that may become a failure."""
+    """Keeps small pictures of the last seconds, and in `open` the onset of every ongoing condition that may become a failure."""
 
     def __init__(self) -> None:
         self._pictures: deque[tuple[int, Image]] = deque(maxlen=_KEPT)
-        self._open: dict[FailureKind, Onset] = {}
+        self.open: dict[FailureKind, Onset] = {}
         self._belief: Belief | None = None
         self._fix: tuple[int, float] = (-(1 << 62), 0.0)
         self._break: Onset | None = None
@@ -113,29 +113,24 @@ class OnsetRecorder:
         if last is not None and self._breaks(last[0], estimate):
             self._break = self._onset(stamp_ns, frame, odom_from_body, estimate.view)
         for kind, began_ns in begun_ns.items():
-            if kind not in self._open or self._open[kind].stamp_ns != began_ns:
-                self._open[kind] = self._onset(began_ns, frame, odom_from_body, estimate.view)
-        for kind in [kind for kind in self._open if kind not in begun_ns]:
-            del self._open[kind]
+            if kind not in self.open or self.open[kind].stamp_ns != began_ns:
+                self.open[kind] = self._onset(began_ns, frame, odom_from_body, estimate.view)
+        for kind in [kind for kind in self.open if kind not in begun_ns]:
+            del self.open[kind]
         if not self._pictures or stamp_ns - self._pictures[-1][0] >= _EVERY_NS:
             self._pictures.append((stamp_ns, reduced(_left(frame, estimate.view))))
-
-    @property
-    def search(self) -> Onset | None:
-        """Return the onset of the ongoing search for the pose."""
-        return self._open.get(FailureKind.NOT_FOUND)
 
     def onset(self, kind: FailureKind, began_ns: int, frame: RectifiedFrame, *, was_carried: bool = False) -> Onset:
         """Return the onset of a detected failure; for a carried robot, that of the lost tracks."""
         assert self._last is not None
         if was_carried and self._break is not None and self._is_break_of(began_ns):
             return self._break
-        found = self._open.get(kind)
+        found = self.open.get(kind)
         return found if found is not None else self._onset(began_ns, frame, self._last[1], self._last[0].view)
 
     def evidence(self, estimate: Estimate, kind: FailureKind, began_ns: int, odom_from_body: Array) -> Evidence:
         """Return evidence for the cause of a failure detected with this estimate."""
-        found = self._open.get(kind)
+        found = self.open.get(kind)
         belief = self._belief if found is None else found.belief
         elsewhere, wrong_by_m, had_fix = estimate.hypotheses, estimate.moved_m, False
         if belief is not None:

@@ -24,6 +24,7 @@ Canvas = NDArray[np.uint8]
 Matches = tuple[Array, Array, NDArray[np.int64]]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
 _LETTERS = 0.55  # font scale of the title, if it fits
+_MATCHES_WIDTH_PX = 800
 # Width of a blurred picture's content: a face 0.7 m before a lens of 60 degrees or more is 6 pixels wide; from 7 on people recognise it.
 # Source: Sinha et al. 2006, Face recognition by humans: nineteen results all computer vision researchers should know about, result 1.
 _COARSE_PX = 32
@@ -98,9 +99,6 @@ def small_jpeg(image: NDArray[np.uint8], width_px: int, max_bytes: int) -> bytes
 
 def _at(pixel: Array) -> tuple[int, int]:
     return round(float(pixel[0])), round(float(pixel[1]))
-
-
-_MATCHES_WIDTH_PX = 800
 
 
 class RobotProfile(NamedTuple):

@@ -13,6 +13,8 @@ from locclient.localization.estimate import Estimate
 from locclient.robot.failure_monitor import failure_cause
 from locclient.robot.robot import Outcome
 
+Figure = float | int | str | bool | None
+_RECENT = 300  # frames
 _ENOUGH_M = 5.0  # of driving: tens of queries from different places, enough to localize a robot in its map
 _OFF_MAP_WORDS = "the map has no tile where the robot believes to be: is its prior right, and the map of this building?"
 _MAP_WORDS = (
@@ -96,10 +98,6 @@ class SearchWay:
         return (
             f"no frame was localized, but {way} in {self.seconds:.1f} s are too short to say why: drive {_ENOUGH_M:g} m"
         )
-
-
-_RECENT = 300
-Figure = float | int | str | bool | None
 
 
 class HealthFigures:

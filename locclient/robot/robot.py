@@ -8,7 +8,7 @@ from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
-from fleetmap.messages import Cause, Flag, PoseMessage, Status
+from fleetmap.messages import Cause, FailureKind, Flag, PoseMessage, Status
 from fleetmap.odometry.mono.mono_modes import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -258,7 +258,7 @@ class Robot:
         onset = self._onsets.onset(failure.kind, began_ns, frame, was_carried=was_carried)
         lasted_s = failure.duration_s + max(0, began_ns - onset.stamp_ns) * 1e-9
         failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
-        unmatched = onset if was_carried else self._onsets.search or onset
+        unmatched = onset if was_carried else self._onsets.open.get(FailureKind.NOT_FOUND, onset)
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut)
 
