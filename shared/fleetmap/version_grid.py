@@ -130,7 +130,7 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     """
     nothing = "no recording showed anything near"
     tiles, address = {}, layer_address(manifest, report_of(manifest), "grid", "occupancy_grid", nothing)
-    for entry in read_index(blob(address)).tiles:
+    for entry in decode_index(blob(address), GridIndex, "a grid", tiles=()).tiles:
         place, cells = decode_grid_tile(blob(entry.sha256))
         if place != (entry.x, entry.y):
             fault = f"grid tile {place} stands in the place of {entry.x}, {entry.y}"
@@ -143,12 +143,12 @@ def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> dict[st
     """Addresses and sizes of a version's grid, of its index and its tiles; none if absent. blob: the verified bytes of an address, up to
     a given size.
 
-    Raises MapFormatError if they exceed the size in the manifest; errors as of `read_index`.
+    Raises MapFormatError if they exceed the size in the manifest; errors as of `decode_index`.
     """
     report = report_of(manifest)
     if report is None or report.sha256 is None:
         return {}
-    index = read_index(blob(report.sha256, report.bytes))
+    index = decode_index(blob(report.sha256, report.bytes), GridIndex, "a grid", tiles=())
     if sum(entry.bytes for entry in index.tiles) > report.bytes:
         raise MapFormatError(f"grid of version {manifest.version}: more than the {report.bytes} bytes of its manifest")
     return {report.sha256: report.bytes} | {entry.sha256: entry.bytes for entry in index.tiles}
@@ -163,11 +163,6 @@ def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 def report_of(manifest: Manifest) -> GridReport | None:
     """The build's report of its grid, None if the build had to make none. MapFormatError for invalid content."""
     return manifest_entry(manifest, "report", GRID_KEY, GridReport)
-
-
-def read_index(data: bytes) -> GridIndex:
-    """Decode the index in `data`; errors as of `decode_index`."""
-    return decode_index(data, GridIndex, "a grid", tiles=())
 
 
 def layer_address(manifest: Manifest, report: LayerReport | None, what: str, setting: str, otherwise: str) -> str:

@@ -48,9 +48,9 @@ CHANNELS: dict[str, Schema] = {topic: kind.get_schema() for topic, kind in _KIND
     "/failures/report": REPORT
 }
 
-_GOOD, _WARN, _BAD = (0.15, 0.65, 0.35), (0.95, 0.65, 0.1), (0.85, 0.2, 0.2)
-_QUIET = (0.55, 0.55, 0.55)
-_COLOURS: dict[str, tuple[float, float, float]] = {
+_GOOD, _WARN = fox.Color(r=0.15, g=0.65, b=0.35, a=1.0), fox.Color(r=0.95, g=0.65, b=0.1, a=1.0)
+_BAD, _QUIET = fox.Color(r=0.85, g=0.2, b=0.2, a=1.0), fox.Color(r=0.55, g=0.55, b=0.55, a=1.0)
+_COLOURS: dict[str, fox.Color] = {
     Status.TRACKING: _GOOD,
     Status.DEGRADED: _WARN,
     Status.AMBIGUOUS: _BAD,
@@ -157,7 +157,7 @@ def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", fr
     """All robots as arrows with labels; replaces those shown before."""
     entities = []
     for mark in marks:
-        colour, above = _colour(_COLOURS.get(mark.status, _QUIET)), mark.map_from_base.copy()
+        colour, above = _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
         above[2, 3] += 0.6
         sizes = {"shaft_length": 0.5, "shaft_diameter": 0.15, "head_length": 0.3, "head_diameter": 0.35}
         arrow = fox.ArrowPrimitive(pose=_located(mark.map_from_base), color=colour, **sizes)
@@ -193,10 +193,10 @@ def lens(stamp_ns: int, camera: StereoCamera) -> ChannelMessage:
 
 def matches(stamp_ns: int, pixels: Array, expected: Array | None = None) -> ChannelMessage:
     """Observed pixels (N, 2) of landmarks; expected (N, 2): pixels predicted by the map, joined by lines."""
-    drawn = [_annotation(stamp_ns, pixels, fox.PointsAnnotationType.Points, _colour(_GOOD))]
+    drawn = [_annotation(stamp_ns, pixels, fox.PointsAnnotationType.Points, _GOOD)]
     if expected is not None:
         ends = np.column_stack([pixels, expected]).reshape(-1, 2)
-        drawn.append(_annotation(stamp_ns, ends, fox.PointsAnnotationType.LineList, _colour(_WARN)))
+        drawn.append(_annotation(stamp_ns, ends, fox.PointsAnnotationType.LineList, _WARN))
     return _stamped("/camera/matches", stamp_ns, points=drawn)
 
 
@@ -215,7 +215,7 @@ def lines(stamp_ns: int, ends_m: Array, topic: str, frame: str) -> ChannelMessag
         thickness=2.0,
         scale_invariant=True,
         points=corners,
-        color=_colour(_WARN),
+        color=_WARN,
     )
     return _scene(topic, stamp_ns, [_entity(stamp_ns, frame, topic, lines=[line])])
 
@@ -277,7 +277,3 @@ def _parts(target_from_source: Array) -> tuple[fox.Vector3, fox.Quaternion]:
 def _located(target_from_source: Array) -> fox.Pose:
     position, orientation = _parts(target_from_source)
     return fox.Pose(position=position, orientation=orientation)
-
-
-def _colour(rgb: tuple[float, float, float]) -> fox.Color:
-    return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0)
