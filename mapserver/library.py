@@ -12,8 +12,7 @@ from fleetmap.errors import StateError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from fleetmap.mapformat.names import check_name
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile
 from fleetmap.recordings.sensor_subset import sensor_set_of
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases

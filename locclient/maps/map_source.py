@@ -21,8 +21,7 @@ from fleetmap.errors import (
 )
 from fleetmap.mapformat.manifest import Manifest, TileEntry, decode_manifest
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, verified
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile
 from fleetmap.messages import WantedVersion
 from locclient.maps.loaded_map import Cell, LoadedMap
 from locclient.maps.tile_cache import TileCache

@@ -23,7 +23,7 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import StateError
 from fleetmap.hooks import plugins
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
-from fleetmap.mapformat.tile_codec import TILE_FORMAT
+from fleetmap.mapformat.tile import TILE_FORMAT
 from mapserver.api import building_routes, fleet_routes, inbox_routes, people_routes, problems, version_routes, views
 from mapserver.api import parameters as p
 from mapserver.api.guard import Guard, Sender

@@ -14,7 +14,7 @@ import numpy as np
 
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.mapformat.building import ALIGNMENT
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.version_grid import OccupancyGrid, known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Layer, Picture

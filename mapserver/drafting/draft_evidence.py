@@ -18,8 +18,7 @@ from fleetmap.failure_definition import is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile, encode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile, encode_tile
 from fleetmap.recordings import Recording
 from fleetmap.relocalization.map_view import MapView, places_around
 from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, is_reliable

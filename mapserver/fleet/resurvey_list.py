@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.manifest import TileEntry
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from mapserver.fleet_statistics import resurvey_decision as decision
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.floor_plan.survey_requests import SurveyRequest

@@ -16,7 +16,7 @@ import msgspec
 from fleetmap.encoding import to_plain
 from fleetmap.errors import GateRefusedError, InvalidValueError, StateError, UsageError
 from fleetmap.mapformat.manifest import decode_manifest
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from mapserver.fleet_statistics.canary_decision import threshold_for
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, IN_USE, KIND
 from mapserver.quality.figures import TRUSTED_KEY, TrustedCalibration, trusted_calibrations

@@ -26,7 +26,7 @@ from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat.building import AREAS, BUILDING_KEY
 from fleetmap.mapformat.manifest import BlobEntry, Manifest, TileEntry, decode_manifest, encode_manifest
 from fleetmap.mapformat.names import check_name, current_path
-from fleetmap.mapformat.tile_codec import encode_tile
+from fleetmap.mapformat.tile import encode_tile
 from fleetmap.mapformat.version_file import ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
 from mapserver.store import files as disk

@@ -71,8 +71,7 @@ def record(
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.recorder import Order, record_order
-    from fleetsim.sensors.measurements import parse_fault
-    from fleetsim.sensors.robots import HiddenErrors
+    from fleetsim.sensors import HiddenErrors, parse_fault
 
     order = Order(
         scenario, seed, day, light, robot, lens, frames, tuple(parse_fault(text) for text in fault or []), _size_px(size),

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.sensors.samples import CameraFrame, Image
-from fleetsim.scene.light import sensor_noise_of
+from fleetsim.scene.world import sensor_noise_of
 
 Grey = NDArray[np.float32]
 _WHITE = 255.0

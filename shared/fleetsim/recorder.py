@@ -22,20 +22,22 @@ from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
-from fleetsim.scene.light import LIGHT_STATES
-from fleetsim.scene.world import World
-from fleetsim.sensors.measurements import (
+from fleetsim.scene.world import LIGHT_STATES, World
+from fleetsim.sensors import (
     LATE_S,
     Fault,
     FaultPlan,
+    HiddenErrors,
+    RobotKind,
     measure_depth,
     measure_imu,
     measure_priors,
     measure_wheels,
+    nominal_calibration,
     sample_times,
     stamps_from_s,
+    true_calibration,
 )
-from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
 _SEEDS_PER_STOREY = 1 << 20

@@ -15,10 +15,9 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import Image
 from fleetsim.motion import Motion
 from fleetsim.scene.layout import mix
-from fleetsim.scene.light import GREY_PER_MS, LIGHT_STATES, Exposure, auto_exposure, sensor_noise_of
 from fleetsim.scene.movers import Mover, add_movers, mover_light
-from fleetsim.scene.world import Scene, World
-from fleetsim.sensors.measurements import OVER_EXPOSURE, Fault, FaultPlan
+from fleetsim.scene.world import GREY_PER_MS, LIGHT_STATES, Exposure, Scene, World, auto_exposure, sensor_noise_of
+from fleetsim.sensors import OVER_EXPOSURE, Fault, FaultPlan
 
 _WIDEST_TANGENT = 2.5  # a single plane for rays further out than this (68 degrees) would be too large
 _DIFFERENCE_PX = 0.5

@@ -9,8 +9,7 @@ from fleetmap.errors import chosen
 from fleetsim.motion import Route
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover, patrol
-from fleetsim.sensors.measurements import Fault
-from fleetsim.sensors.robots import ROBOTS, RobotKind
+from fleetsim.sensors import ROBOTS, Fault, RobotKind
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,7 @@ import pytest
 
 from fleetmap.errors import SurveyError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive

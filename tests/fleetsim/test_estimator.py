@@ -12,8 +12,7 @@ from fleetmap.relocalization.map_view import MapView
 from fleetsim.recorder import Order, prepare
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import World
-from fleetsim.sensors.measurements import Fault
-from fleetsim.sensors.robots import HiddenErrors
+from fleetsim.sensors import Fault, HiddenErrors
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Smudge, unpictured
 from support.estimator.statistics import FeatureStatistics, FlowStatistics

@@ -15,8 +15,7 @@ from fleetmap.sensors.samples import SensorSet
 from fleetsim.cli import app
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.sensors.measurements import Fault
-from fleetsim.sensors.robots import HiddenErrors
+from fleetsim.sensors import Fault, HiddenErrors
 
 SIZE = ["--size", "160x120"]
 

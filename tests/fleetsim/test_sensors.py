@@ -6,10 +6,9 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
 from fleetmap.sensors.samples import ImuSamples
+from fleetsim import sensors
 from fleetsim.motion import Limits, Route, RouteMotion, Shake
-from fleetsim.sensors import measurements
-from fleetsim.sensors.measurements import START_NS, Fault, FaultPlan, measure_imu, measure_priors, measure_wheels
-from fleetsim.sensors.robots import ImuErrors
+from fleetsim.sensors import START_NS, Fault, FaultPlan, ImuErrors, measure_imu, measure_priors, measure_wheels
 
 Array = NDArray[np.float64]
 
@@ -86,9 +85,9 @@ def test_imu_gap_and_spike() -> None:
     assert np.abs(samples.accel_mps2).max() < 40
 
 
-@pytest.mark.parametrize("name", list(measurements.FAULTS))
+@pytest.mark.parametrize("name", list(sensors.FAULTS))
 def test_every_fault_can_be_asked_for(name: str) -> None:
-    assert measurements.parse_fault(f"{name}@8+2.5") == Fault(name, 8.0, 10.5)
+    assert sensors.parse_fault(f"{name}@8+2.5") == Fault(name, 8.0, 10.5)
 
 
 @pytest.mark.parametrize(
@@ -96,4 +95,4 @@ def test_every_fault_can_be_asked_for(name: str) -> None:
 )
 def test_nonsense_faults_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="fault"):
-        measurements.parse_fault(text)
+        sensors.parse_fault(text)

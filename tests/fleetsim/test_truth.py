@@ -13,9 +13,8 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetsim.motion import Route, RouteMotion
 from fleetsim.renderer import Painter, RigRenderer, make_optics
 from fleetsim.scene.layout import Layout
-from fleetsim.scene.light import Exposure
-from fleetsim.scene.world import World
-from fleetsim.sensors.robots import ROBOTS, nominal_calibration
+from fleetsim.scene.world import Exposure, World
+from fleetsim.sensors import ROBOTS, nominal_calibration
 
 Array = NDArray[np.float64]
 MOMENTS_S = (3.0, 6.0, 9.5, 12.0, 14.0)

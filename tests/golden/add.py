@@ -12,7 +12,7 @@ import msgspec  # noqa: E402
 import numpy as np  # noqa: E402
 
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT  # noqa: E402
-from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
+from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
 from fleetmap.mapformat.version_file import EXPORT_FORMAT  # noqa: E402
 from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report  # noqa: E402

@@ -14,7 +14,7 @@ from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.map_view import MapView
 from fleetsim.motion import LIFT_S
 from fleetsim.recorder import Order, Session
-from fleetsim.sensors.measurements import Fault, FaultPlan
+from fleetsim.sensors import Fault, FaultPlan
 from locclient.localization.estimate import Estimate
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, unpictured

@@ -18,7 +18,7 @@ from fleetsim.motion import Route
 from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
-from fleetsim.sensors.measurements import Fault
+from fleetsim.sensors import Fault
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.replay import run_metrics

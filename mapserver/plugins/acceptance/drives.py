@@ -20,7 +20,7 @@ from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.recordings.tum import read_tum

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.relocalization.map_view import MapView
 from mapserver.config import MapserverConfig
 from mapserver.dashboard.plan import make_plan

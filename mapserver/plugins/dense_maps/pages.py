@@ -9,7 +9,7 @@ import numpy as np
 from fastapi import Response
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.messages import CameraNote, FailureReport
 from mapserver.dashboard.console import Page, PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.files import appearing_file
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.plugins.viewer_channels import require_foxglove
 from mapserver.fleet.exports import failures_oldest_first
 from mapserver.store import FailureFilter, MapStore

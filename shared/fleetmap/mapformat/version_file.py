@@ -28,7 +28,7 @@ from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError, StoreError, check_format, disk_errors
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, Name, Positive, Sha256, decode_manifest
 from fleetmap.mapformat.names import check_name, verified
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 
 EXPORT_MAGIC = b"FMEX"
 EXPORT_FORMAT = 3

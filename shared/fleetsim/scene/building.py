@@ -6,8 +6,7 @@ import numpy as np
 
 from fleetsim.scene.faces import MATERIAL_FLOOR, MATERIAL_LAMP, NO_BOTTOM, FaceBuilder, Surface
 from fleetsim.scene.layout import Layout, Rectangle, mix
-from fleetsim.textures.atlas import TEXEL_M
-from fleetsim.textures.painting import MARGIN_SHARE
+from fleetsim.textures.painting import MARGIN_SHARE, TEXEL_M
 from fleetsim.textures.texture_set import Textures
 
 GROUP_DAY, GROUP_NIGHT, GROUP_SKY = 0, 1, 2  # lamp groups that are switched together

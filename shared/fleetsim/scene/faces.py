@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetsim.textures.atlas import TEXEL_M
+from fleetsim.textures.painting import TEXEL_M
 
 MATERIAL_PLAIN, MATERIAL_FLOOR, MATERIAL_LAMP = 0, 1, 2
 FACE_NAMES = "xXyYzZ"  # lower case: the negative side

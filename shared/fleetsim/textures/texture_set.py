@@ -6,8 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from fleetsim.textures import painting
-from fleetsim.textures.atlas import Atlas
-from fleetsim.textures.painting import noise
+from fleetsim.textures.painting import Atlas, noise
 
 SKUS, LABELS, POSTERS, RACK_LABELS = 28, 64, 24, 512
 _DECALS = (("scuffs", 6), ("stains", 3), ("cracks", 4), ("sticker", 6), ("repair", 4))

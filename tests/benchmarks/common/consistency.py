@@ -13,8 +13,16 @@ from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion import Route, RouteMotion
 from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.sensors.measurements import START_NS, Fault, FaultPlan, measure_imu, measure_wheels, sample_times
-from fleetsim.sensors.robots import nominal_calibration, true_calibration
+from fleetsim.sensors import (
+    START_NS,
+    Fault,
+    FaultPlan,
+    measure_imu,
+    measure_wheels,
+    nominal_calibration,
+    sample_times,
+    true_calibration,
+)
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, unpictured
 

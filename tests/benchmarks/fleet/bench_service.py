@@ -24,8 +24,7 @@ from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.manifest import Manifest, decode_manifest
 from fleetmap.mapformat.names import verified
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile
 from fleetmap.messages import WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import ChunkReader
 from mapserver import releases

@@ -23,15 +23,14 @@ from rich.console import Console
 from benchmarks.common.recorded_runs import Options, Results, benchmark, played
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session, record_order
 from fleetsim.scenarios import SCENARIOS, Run
-from fleetsim.sensors.measurements import Fault
-from fleetsim.sensors.robots import HiddenErrors
+from fleetsim.sensors import Fault, HiddenErrors
 from locclient.replay import run_metrics
 from mapserver.drafting.draft import BuildOptions
 from mapserver.library import build_map

@@ -20,7 +20,7 @@ from fleetmap.errors import UsageError
 from fleetmap.failure_definition import is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, so3_exp
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from fleetmap.recordings import open_recording
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier

@@ -28,7 +28,7 @@ from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
-from fleetsim.sensors.measurements import Fault
+from fleetsim.sensors import Fault
 from locclient.localization.estimate import Estimate
 from locclient.replay import run_metrics
 from studies.robot_days.drives import judged

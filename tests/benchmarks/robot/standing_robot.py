@@ -9,7 +9,7 @@ from fleetsim.motion import GRAVITY_MPS2
 from fleetsim.recorder import Session
 from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_times
+from fleetsim.sensors import measure_imu, measure_wheels, sample_times
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import rotation_angle_rad, rotation_from_quat_wxyz, se3, so3_exp
-from fleetmap.mapformat import tile_codec as quantise
+from fleetmap.mapformat import tile as quantise
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, decode_tile, encode_tile
+from fleetmap.mapformat.tile import LANDMARK_BYTES, MAX_TILE_PLACES, Tile, decode_tile, encode_tile
 from support.storage.map_samples import random_tile
 
 LIMIT = 64 << 20

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inver
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
-from fleetsim.sensors.measurements import Fault
+from fleetsim.sensors import Fault
 from support.estimator.simulated_run import EstimatorSession
 
 WITHOUT_WHEELS = OdometrySettings(filter=FilterSettings(use_wheels=False))

@@ -11,7 +11,7 @@ import pytest
 from fleetmap.errors import StoreError
 from fleetmap.mapformat.manifest import decode_manifest
 from fleetmap.mapformat.names import blob_path, sha256_hex
-from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
+from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile
 from fleetmap.messages import RobotAck, RobotHealth, Thumbnail
 from mapserver.api import fleet_routes
 from mapserver.quality.figures import Evidence, RigEvidence

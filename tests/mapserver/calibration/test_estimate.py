@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetsim.recorder import Order
-from fleetsim.sensors.robots import LENSES
+from fleetsim.sensors import LENSES
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter
 from mapserver.calibration.estimate import estimate_from
 from mapserver.calibration.image_rows import Observations

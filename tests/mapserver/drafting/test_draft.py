@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.bow.vocabulary import DEFAULT_VOCABULARY_SHA256, decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive

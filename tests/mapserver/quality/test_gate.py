@@ -14,8 +14,7 @@ from fleetmap.features.orb import Features, detect_in_slices
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat.manifest import BlobEntry, CameraEntry, Manifest, RecordingEntry, TileEntry
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import encode_tile
+from fleetmap.mapformat.tile import Tile, encode_tile
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier

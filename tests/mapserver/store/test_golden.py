@@ -12,7 +12,7 @@ import pytest
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat.container import pack
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT, decode_manifest, encode_manifest
-from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
+from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile
 from fleetmap.mapformat.version_file import EXPORT_FORMAT
 from fleetmap.messages import decode_message, encode_message
 from fleetmap.version_grid import known_grid

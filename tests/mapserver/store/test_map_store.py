@@ -14,7 +14,7 @@ import pytest
 
 from fleetmap.errors import GateRefusedError, MapFormatError, StoreError
 from fleetmap.mapformat.names import current_path, sha256_hex
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import decode_tile
 from mapserver import releases
 from mapserver.store import Actor, DraftContent, MapStore, chain_faults
 from mapserver.store.places import read_places

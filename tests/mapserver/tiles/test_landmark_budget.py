@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap import core
 from fleetmap.geometry import Array, se3_exp
-from fleetmap.mapformat.tile_codec import encode_tile
+from fleetmap.mapformat.tile import encode_tile
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap, history_of
 from mapserver.tiles import tiling as module

@@ -14,7 +14,7 @@ from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover
 from fleetsim.scene.world import World
-from fleetsim.sensors.measurements import Fault
+from fleetsim.sensors import Fault
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Smudge, unpictured
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleetsim.motion import Route
 from fleetsim.scene.movers import patrol
-from fleetsim.sensors.measurements import Fault
+from fleetsim.sensors import Fault
 from studies.robot_days.site import LAYOUT, Trip, random_route
 from support.estimator.simulated_run import Smudge
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import decode_manifest
-from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
+from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile
 from fleetmap.mapformat.version_file import open_export
 from fleetmap.version_grid import TILE_CELLS, decode_grid_tile, encode_grid
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive

@@ -13,8 +13,7 @@ from typing import Any, BinaryIO
 
 from fleetmap.errors import RecordingError
 from fleetmap.plugins.other_recorders.decoders import AnyEncoding, ros1_digest
-from fleetmap.plugins.other_recorders.streams import open_messages
-from fleetmap.plugins.other_recorders.topics import KNOWN_TYPES, note_videos
+from fleetmap.plugins.other_recorders.streams import KNOWN_TYPES, note_videos, open_messages
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES

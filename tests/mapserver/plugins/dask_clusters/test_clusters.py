@@ -10,7 +10,7 @@ from distributed import Client, LocalCluster, Security
 
 from fleetmap.bow.vocabulary import decode_vocabulary, default_vocabulary_bytes
 from fleetmap.errors import LinkError, UsageError
-from fleetmap.mapformat.tile_codec import encode_tile
+from fleetmap.mapformat.tile import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from mapserver.drafting.worker import open_executor

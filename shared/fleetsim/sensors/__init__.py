@@ -1,1 +1,0 @@
-"""Robots, their sensors, and sensor faults."""
