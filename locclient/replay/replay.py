@@ -119,7 +119,9 @@ def replay(
         outcome = robot.handle(replace(before, frame=raw))
         wall_s = time.monotonic() - wall_s
         if outcome is not None:  # else the view that it follows has no image in this frame
-            _add(result, outcome, source.truth_map_from_body(number), wall_s, decode_s)
+            truth = source.recording.ground_truth
+            place = None if truth is None else truth.at(source.recorded_stamp_ns(number))
+            _add(result, outcome, place, wall_s, decode_s)
             if options.export is not None:
                 options.export.handle(raw, outcome)
         options.progress(number)

@@ -2,11 +2,8 @@
 
 import bz2
 from collections.abc import Callable
-from pathlib import Path
 
 import zstandard
-
-from fleetmap.errors import RecordingError
 
 # Of a message, a chunk, an attachment: one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
 MAX_MESSAGE_BYTES = 64 << 20
@@ -17,45 +14,13 @@ MAX_CALIBRATION_BYTES = 1 << 20  # a camchain of two cameras has 2 kB
 MAX_VIDEO_TABLE_BYTES = 256 << 20
 # Limit on data kept beside the images (schemas, metadata, IMU and so on), by the size of the file. Messages of zeros are
 # the extreme: zstd compresses recorded odometry, mostly empty covariances, 8 to 1, and zeros 30,000 to 1.
-_KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
-_KEPT_RECORD_BYTES = 256  # memory of a record's place, stamp and object
+KEPT_BYTES, KEPT_PER_FILE_BYTE = 64 << 20, 32
+KEPT_RECORD_BYTES = 256  # memory of a record's place, stamp and object
 # Records that a file of any size may have, and bytes of it for each further one: no recorder packs one into less than ten.
-_PASSED_RECORDS, _LEAST_RECORD_BYTES = 250_000, 4
+PASSED_RECORDS, LEAST_RECORD_BYTES = 250_000, 4
 # Bytes to which a file of any size may unpack, and for each byte of it: pictures of a simulator, a wall without noise, pack 100
 # to 1. The limit takes a second of the processor for 4 MiB of the file.
-_UNPACKED_BYTES, _UNPACKED_PER_FILE_BYTE = 1 << 30, 256
-
-
-class KeptBytes:
-    """Counts what is unpacked and read of files of `size` bytes, and the memory kept for them."""
-
-    def __init__(self, path: Path, size: int) -> None:
-        self.path, self.size, self._kept, self._passed, self._unpacked = path, size, 0, 0, 0
-
-    def unpack(self, compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
-        """See `unpack`; RecordingError if the file unpacks to more than a real recording can. Damaged bytes count as `most_bytes`."""
-        self._limit(self._unpacked, _UNPACKED_BYTES + _UNPACKED_PER_FILE_BYTE * self.size, "bytes;")
-        self._unpacked += most_bytes
-        unpacked = unpack(compression, packed, most_bytes)
-        self._unpacked -= most_bytes - len(unpacked)
-        return unpacked
-
-    def pass_record(self) -> None:
-        """Count a record that is read, kept or not; RecordingError if the file unpacks to more than a real recording can."""
-        self._passed += 1
-        self._limit(self._passed, _PASSED_RECORDS + self.size // _LEAST_RECORD_BYTES, "records;")
-
-    def keep(self, size: int) -> None:
-        """Count a record of `size` bytes kept in memory; RecordingError if the file unpacks to more than a real recording can."""
-        self._kept += size + _KEPT_RECORD_BYTES
-        most = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
-        self._limit(self._kept, most, "bytes beside the images; no recorder writes that,")
-
-    def _limit(self, count: int, most: int, words: str) -> None:
-        if count > most:
-            raise RecordingError(
-                f"{self.path}: {self.size} bytes unpack to more than {most} {words} leave the file out"
-            )
+UNPACKED_BYTES, UNPACKED_PER_FILE_BYTE = 1 << 30, 256
 
 
 def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:

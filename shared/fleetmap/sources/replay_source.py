@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, wheel_between
@@ -70,8 +69,3 @@ class ReplaySource:
             priors = [prior for prior in recording.priors if since_ns < prior.stamp_ns <= until_ns]
             yield SensorBundle(None, imu, list(wheel), priors)
             since_ns = until_ns
-
-    def truth_map_from_body(self, number: int) -> Array | None:
-        """The recording's ground truth at frame `number`, None if absent."""
-        truth = self.recording.ground_truth
-        return None if truth is None else truth.at(self.recorded_stamp_ns(number))

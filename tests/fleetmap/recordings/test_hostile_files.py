@@ -131,7 +131,7 @@ ROS1 = pytest.param("ros1", marks=needs_plugin("rosbag1"))
 @pytest.mark.parametrize("kind", ["chunks", "chunks without messages", "messages", SQLITE, ROS1])
 def test_what_is_unpacked_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Black pictures of a megabyte, each within its limit: 8 MiB of them took minutes."""
-    monkeypatch.setattr(limits, "_UNPACKED_BYTES", 1 << 20)
+    monkeypatch.setattr(limits, "UNPACKED_BYTES", 1 << 20)
     black = StoredImage("mono8", bytes(1 << 20), "", 1024, 1024, 1024)
     images = [("/cam0/image_raw", "sensor_msgs/Image", t, encode_image(t, "c", black)) for t in range(1, 200)]
     path = tmp_path / "black"

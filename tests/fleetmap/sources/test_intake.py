@@ -204,7 +204,8 @@ def test_backwards_the_pictures_turn_and_the_stamps_rise(recording: Recording) -
     for number, (frame, image) in enumerate(zip(frames, SAMPLE.left[1::3][::-1], strict=True)):
         np.testing.assert_array_equal(frame.left, image)
         assert played.recorded_stamp_ns(number) == SAMPLE.stamps_ns[1::3][::-1][number]
-        truth = played.truth_map_from_body(number)
+        assert recording.ground_truth is not None
+        truth = recording.ground_truth.at(played.recorded_stamp_ns(number))
         np.testing.assert_allclose(truth, SAMPLE.world_from_body[1::3][::-1][number], atol=1e-9)
     assert played.calibration.imu is None, "its samples would say the opposite of what happens"
     assert [len(before.imu) for before in played.samples_before_each()] == [0, 0, 0]

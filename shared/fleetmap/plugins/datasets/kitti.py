@@ -33,11 +33,6 @@ def recognises(path: Path) -> bool:
     return any((path / left).is_dir() or (path / right).is_dir() for left, right, _, _ in _PAIRS)
 
 
-def recognises_raw(path: Path) -> bool:
-    """True for a drive of KITTI's raw data."""
-    return (path / "image_00/data").is_dir()
-
-
 def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
     """Open the drive in a folder of KITTI's raw data, rectified or not, all of its cameras. The body is camera 0."""
     log = ReadLog()
@@ -170,5 +165,8 @@ def _ground_truth(file: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
 
 FORMAT = RecordingFormat("a folder with image_l or image_0 and calib.txt", recognises, open_kitti, rank=-4)
 RAW_FORMAT = RecordingFormat(
-    "a folder with image_00/data and calib_cam_to_cam.txt", recognises_raw, open_kitti_raw, rank=-3
+    "a folder with image_00/data and calib_cam_to_cam.txt",
+    lambda path: (path / "image_00/data").is_dir(),
+    open_kitti_raw,
+    rank=-3,
 )

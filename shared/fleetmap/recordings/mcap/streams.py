@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
+from fleetmap.recordings import limits
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize, logged_calibration
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
-from fleetmap.recordings.limits import KeptBytes
 from fleetmap.recordings.ordering import (
     LAST_NS,
     ReadLog,
@@ -56,11 +56,15 @@ class Channel:
 Message = tuple[Channel, int, Place, memoryview]
 
 
-class Container(KeptBytes):
-    """Base of the open files of a recording of messages. files: covered by its hash; name: its own name, or empty."""
+class Container:
+    """Base of the open files of a recording of messages. files: covered by its hash; name: its own name, or empty.
+
+    Counts what is unpacked and read of them, and the memory kept for them.
+    """
 
     def __init__(self, files: Sequence[Path]) -> None:
-        super().__init__(files[0], sum(file.stat().st_size for file in files))
+        self.path, self.size = files[0], sum(file.stat().st_size for file in files)
+        self._kept = self._passed = self._unpacked = 0
         self.files, self.name = files, ""
         self.attachments: dict[str, bytes] = {}
         self.issues: list[DataIssue] = []
@@ -91,6 +95,31 @@ class Container(KeptBytes):
 
     def close(self) -> None:
         """Close the files."""
+
+    def unpack(self, compression: str, packed: bytes | memoryview, most_bytes: int = limits.MAX_MESSAGE_BYTES) -> bytes:
+        """See `limits.unpack`; RecordingError beyond what a real recording unpacks to. Damaged bytes count as `most_bytes`."""
+        self._limit(self._unpacked, limits.UNPACKED_BYTES + limits.UNPACKED_PER_FILE_BYTE * self.size, "bytes;")
+        self._unpacked += most_bytes
+        unpacked = limits.unpack(compression, packed, most_bytes)
+        self._unpacked -= most_bytes - len(unpacked)
+        return unpacked
+
+    def pass_record(self) -> None:
+        """Count a record that is read, kept or not; RecordingError if the file unpacks to more than a real recording can."""
+        self._passed += 1
+        self._limit(self._passed, limits.PASSED_RECORDS + self.size // limits.LEAST_RECORD_BYTES, "records;")
+
+    def keep(self, size: int) -> None:
+        """Count a record of `size` bytes kept in memory; RecordingError if the file unpacks to more than a real recording can."""
+        self._kept += size + limits.KEPT_RECORD_BYTES
+        most = limits.KEPT_BYTES + limits.KEPT_PER_FILE_BYTE * self.size
+        self._limit(self._kept, most, "bytes beside the images; no recorder writes that,")
+
+    def _limit(self, count: int, most: int, words: str) -> None:
+        if count > most:
+            raise RecordingError(
+                f"{self.path}: {self.size} bytes unpack to more than {most} {words} leave the file out"
+            )
 
     def note(self, what: str, detail: str) -> None:
         """Note an unreadable part, unless there are very many."""
