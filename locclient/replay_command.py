@@ -185,7 +185,7 @@ def _run(
     from fleetmap.hooks import plugin
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
-    from fleetmap.sources.replay_source import ReplaySource
+    from fleetmap.sources.source import ReplaySource
     from locclient.config import image_priors_of
     from locclient.localization.priors.given import parse_prior
     from locclient.maps.map_client import connected

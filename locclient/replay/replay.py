@@ -19,8 +19,8 @@ from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.lens_fit import lens_of_frames
 from fleetmap.sensors.rectification import MountedCamera, Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet
-from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.sources.source import ReplaySource
 from locclient.identity import MapAddress
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings

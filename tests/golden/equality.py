@@ -28,7 +28,7 @@ from fleetmap.encoding import to_json
 from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient import LocalizeOptions, localize
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings

@@ -1,18 +1,85 @@
-"""Sensor sources of a running robot. To add one: a file and a line in SOURCES, or a plug-in."""
+"""Sensor sources of a running robot, and samples of a replay: a recording, forwards, or backwards with new stamps and without IMU.
+
+To add a source: a file and a line in SOURCES, or a plug-in.
+"""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError, chosen
 from fleetmap.hooks import plugins
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import SensorSet
+from fleetmap.sensors.samples import CameraFrame, SensorSet, wheel_between
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.sensor_bundle import IMU_LEAD_NS, NEVER_NS, SensorBundle
+
+
+@dataclass(frozen=True)
+class ReplaySource:
+    """Selected frames of a recording in the order of play.
+
+    calibration has no IMU when played backwards: its samples would be wrong in that direction.
+    """
+
+    recording: Recording
+    indices: NDArray[np.int64]
+    reverse: bool
+
+    @classmethod
+    def of(cls, recording: Recording, selection: FrameSelection, *, reverse: bool) -> "ReplaySource":
+        """Create the source; raises UsageError if nothing is selected."""
+        indices = selection.apply(recording)
+        return cls(recording, indices[::-1] if reverse else indices, reverse)
+
+    @property
+    def calibration(self) -> RigCalibration:
+        """Calibration of the rig as played."""
+        return replace(self.recording.calibration, imu=None) if self.reverse else self.recording.calibration
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def played_stamp_ns(self, recorded_ns: int) -> int:
+        """Stamp at which a frame is played: mirrored at the last one when backwards."""
+        if not self.reverse:
+            return recorded_ns
+        return 2 * int(self.recording.frame_stamps_ns[self.indices[0]]) - recorded_ns
+
+    def recorded_stamp_ns(self, number: int) -> int:
+        """Original stamp of frame `number` of the playback."""
+        return int(self.recording.frame_stamps_ns[self.indices[number]])
+
+    def frame(self, number: int) -> CameraFrame:
+        """Frame `number` of the playback, decoded."""
+        return self._played(self.recording.read_frame(int(self.indices[number])))
+
+    def _played(self, frame: CameraFrame) -> CameraFrame:
+        others = tuple(None if other is None else self._played(other) for other in frame.others)
+        return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns), others=others)
+
+    def samples_before_each(self) -> Iterator[SensorBundle]:
+        """For each frame of the playback, the other samples that are handled before it; none backwards."""
+        recording, since_ns = self.recording, NEVER_NS
+        # To the clock of the IMU and the wheels
+        offset_ns = int(recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
+        for until_ns in recording.frame_stamps_ns[self.indices].tolist():
+            if self.reverse:
+                yield SensorBundle()
+                continue
+            imu = recording.imu.between(*(ns + offset_ns + IMU_LEAD_NS for ns in (since_ns, until_ns)))
+            wheel = wheel_between(recording.wheel, *(ns + offset_ns + 1 for ns in (since_ns, until_ns)))
+            priors = [prior for prior in recording.priors if since_ns < prior.stamp_ns <= until_ns]
+            yield SensorBundle(None, imu, list(wheel), priors)
+            since_ns = until_ns
+
 
 _ROOM_WAIT_S = 0.1
 _LONGEST_GAP_S = 10.0  # between frames: a longer one, such as days after a change of the clock, is skipped

@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 
 from fleetmap.recordings import FrameSelection, open_recording
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_client import connected

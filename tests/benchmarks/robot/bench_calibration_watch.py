@@ -18,7 +18,7 @@ from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import PositionPrior, wheel_between
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.replay.run_result import ReplayResult
 from support.recordings.calibration_faults import (
     AXES,

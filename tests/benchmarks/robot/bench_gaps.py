@@ -15,7 +15,7 @@ from benchmarks.common.recorded_runs import Options, Results, benchmark, recorde
 from fleetmap.messages import Status
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.replay.run_metrics import FrameRecord
 
 _GAPS_S, _SHARES = (0.25, 0.5, 1.0), (0.0, 0.25, 0.5, 0.75)

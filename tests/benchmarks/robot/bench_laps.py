@@ -13,7 +13,7 @@ from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot

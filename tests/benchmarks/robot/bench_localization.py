@@ -19,7 +19,7 @@ from fleetmap.free_memory import give_back_free_memory
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord

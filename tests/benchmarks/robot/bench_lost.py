@@ -23,7 +23,7 @@ from fleetmap.recordings import open_recording
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from fleetsim.motion import Route
 from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import Run, Scenario

@@ -17,7 +17,7 @@ from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import SensorSet
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
 from support.recordings.realdata import DATA

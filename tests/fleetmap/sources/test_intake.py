@@ -10,7 +10,7 @@ from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from support.recordings.recording_samples import FRAME_NS, make_sample, write_mcap
 
 MS = 1_000_000

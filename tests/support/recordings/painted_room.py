@@ -81,7 +81,7 @@ def write_ride(path: Path, ride: Ride, duration_s: float, sensors: SensorSet) ->
             writer.write_frame(frame_at(ride, stamp_ns, sensors))
             if calibration.imu is not None:
                 writer.write_imu(imu)
-            writer.write_wheel(wheel)
+            writer.write_wheel([wheel])
             writer.write_ground_truth(Trajectory(imu.stamps_ns[:1], ride(stamp_ns * 1e-9)[None]))
 
 

@@ -96,17 +96,16 @@ class McapRecordingWriter:
 
     def write_imu(self, samples: ImuSamples) -> None:
         for stamp_ns, *values in zip(samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True):
-            self._write(
-                self._topics.imu, "sensor_msgs/Imu", stamp_ns, messages.encode_imu(stamp_ns, BODY_FRAME, *values)
-            )
+            data = messages.encode_imu(stamp_ns, BODY_FRAME, *values)
+            self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
 
-    def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
-        for sample in [samples] if isinstance(samples, WheelSample) else samples:
+    def write_wheel(self, samples: Iterable[WheelSample]) -> None:
+        for sample in samples:
             data = messages.encode_odometry(sample, ODOM_FRAME, BASE_FRAME)
             self._write(self._topics.wheel, "nav_msgs/Odometry", sample.stamp_ns, data)
 
-    def write_prior(self, priors: PositionPrior | Iterable[PositionPrior]) -> None:
-        for prior in [priors] if isinstance(priors, PositionPrior) else priors:
+    def write_prior(self, priors: Iterable[PositionPrior]) -> None:
+        for prior in priors:
             data = messages.encode_prior(prior, MAP_FRAME)
             self._write(self._topics.prior, "geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, data)
 

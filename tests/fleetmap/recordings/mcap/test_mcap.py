@@ -33,7 +33,7 @@ TRUTH = Trajectory(SAMPLE.stamps_ns, np.stack(SAMPLE.world_from_body))
 def write(path: Path, **keywords: Any) -> Path:
     with McapRecordingWriter(path, keywords.pop("calibration", calibration()), **keywords) as writer:
         writer.write_imu(IMU)
-        writer.write_wheel(WHEEL)
+        writer.write_wheel([WHEEL])
         writer.write_prior([PRIOR])
         writer.write_ground_truth(TRUTH)
         for stamp, left, right in zip(SAMPLE.stamps_ns.tolist(), SAMPLE.left, SAMPLE.right, strict=True):

@@ -15,7 +15,7 @@ from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import FailureAck, SurveyArea, decode_message
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.source import ReplaySource
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay.replay import fetch_map
