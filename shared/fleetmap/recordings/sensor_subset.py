@@ -20,8 +20,6 @@ REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
     SensorSet.MONO_INERTIAL: (SensorSet.MONO_INERTIAL, SensorSet.MONO),
     SensorSet.MONO: (SensorSet.MONO,),
 }
-_INERTIAL = (SensorSet.STEREO_INERTIAL, SensorSet.MONO_INERTIAL)
-_SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
 
 
 def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
@@ -47,12 +45,12 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
         possible = ", ".join(REDUCTIONS[recording.sensor_set])
         fault = f"is {recording.sensor_set}, it cannot be used as {use}"
         raise RecordingError(f"{recording.path} {fault}; use it as {possible}")
-    calibration, imu = recording.calibration, recording.imu
-    if use not in _INERTIAL:
+    calibration, imu, is_single = recording.calibration, recording.imu, use.startswith("mono")
+    if not use.endswith("-inertial"):
         calibration, imu = replace(calibration, imu=None), ImuSamples.empty()
-    if use in _SINGLE:
+    if is_single:
         calibration = replace(calibration, cameras=calibration.cameras[:1])
-    frames = _Reduced(recording.frames, use in _SINGLE)
+    frames = _Reduced(recording.frames, is_single)
     return replace(recording, sensor_set=use, calibration=calibration, imu=imu, frames=frames)
 
 

@@ -77,19 +77,19 @@ def note_videos(channels: Iterable[Channel], log: ReadLog | Container) -> None:
         log.note("video not read", f"{', '.join(names)}; {advice}")
 
 
-def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: ReadLog) -> dict[str, list[Channel]]:
-    """Choose the channels for each role; several if one topic was recorded on several channels.
+def _choose_topics(streams: Iterable[Stream], wanted: Topics, where: str, log: ReadLog) -> Roles:
+    """Choose the streams for each role; several if one topic was recorded on several channels.
 
     RecordingError if a topic requested by name is absent, or if the left image is ambiguous.
     """
-    by_topic: dict[str, list[Channel]] = {}
-    for channel in channels:
-        by_topic.setdefault(channel.topic, []).append(channel)
-    names = (f"{topic} ({', '.join(c.type_name for c in by_topic[topic])})" for topic in sorted(by_topic))
-    there = ", ".join(names) or "no topic at all"
+    by_topic: dict[str, list[Stream]] = {}
+    for stream in streams:
+        by_topic.setdefault(stream.channel.topic, []).append(stream)
+    types_of = {topic: [stream.channel.type_name for stream in by_topic[topic]] for topic in sorted(by_topic)}
+    there = ", ".join(f"{topic} ({', '.join(names)})" for topic, names in types_of.items()) or "no topic at all"
 
     def having(types: tuple[str, ...]) -> list[str]:
-        return [topic for topic in sorted(by_topic) if any(c.type_name in types for c in by_topic[topic])]
+        return [topic for topic, names in types_of.items() if any(name in types for name in names)]
 
     chosen: dict[str, str] = {}
     for role, types in _TYPES.items():
@@ -123,8 +123,8 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
     roles = {}
     for role, topic in chosen.items():
         types = _TYPES.get(role, INFO_TYPES)  # lenses of further cameras have the names that belong to their images
-        roles[role] = [channel for channel in by_topic[topic] if channel.type_name in types]
-        if others := [channel.type_name for channel in by_topic[topic] if channel.type_name not in types]:
+        roles[role] = [stream for stream in by_topic[topic] if stream.channel.type_name in types]
+        if others := [name for name in types_of[topic] if name not in types]:
             read = f"{' or '.join(types)} is read as {role}"
             log.note("messages of another type", f"{topic}: {', '.join(others)} left out; {read}")
     return roles
@@ -216,16 +216,14 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
     with opened(opener, options) as (container, given, log):
         streams, others = collect(container, partial(_stream_of, container, options.topics), log)
         note_videos(others, log)
-        channels = [stream.channel for stream in streams if stream.messages or isinstance(stream, ImageStream)]
-        if not channels:
+        used = [stream for stream in streams if stream.messages or isinstance(stream, ImageStream)]
+        if not used:
             there = ", ".join(f"{c.topic} ({c.type_name} in {c.encoding or 'no encoding'})" for c in others[:8])
             known = f"; known encodings are {', '.join(ENCODINGS)}" if others else ""
             why = f"{log.told() or there or 'it is empty'}{known}"
             raise RecordingError(f"{container.path} holds no message that can be read ({why})")
-        topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
-        chosen = choose_topics(channels, topics, str(container.path), log)
-        by_id = {stream.channel.id: stream for stream in streams}
-        roles = {role: [by_id[channel.id] for channel in chosen[role]] for role in chosen}
+        topics = _with_hints(options.topics, given, {stream.channel.topic for stream in used})
+        roles = _choose_topics(used, topics, str(container.path), log)
         calibration = given.calibration if given else attached_calibration(container)
         lenses = _lenses_of(roles, log) if calibration is None else {}
 
