@@ -212,13 +212,22 @@ def opened(
 def open_written(path: Path, opener: Callable[[], Container], options: OpenOptions) -> Recording:
     """Open a file that this project wrote: topics by their names, the calibration as attached.
 
-    opener: must be picklable, because other processes may read part of the frames. CalibrationError without a calibration.
+    opener: must be picklable, because other processes may read part of the frames. CalibrationError without a calibration, RecordingError
+    without the left image, and without a topic that the caller named.
     """
     with opened(opener, options) as (container, given, log):
         streams, others = collect(container, lambda channel: _stream_of(container, channel), log)
         there = ", ".join(f"{c.topic} ({c.type_name})" for c in (*(s.channel for s in streams), *others)) or "none"
         found = "; ".join(filter(None, (f"there is {there}", log.told())))
-        roles = _named(streams, options.topics, f"{container.path} has no", found)
+        roles = dict[str, list[Stream]]()
+        for role, types in _TYPES.items():
+            name, of_type = getattr(options.topics, role), [s for s in streams if s.channel.type_name in types]
+            named = {stream.channel.topic: stream for stream in of_type}
+            if stream := next((named[sent] for sent in transports(name, role) if sent in named), None):
+                roles[role] = [stream]
+            elif role == "left" or (name and name != getattr(Topics(), role)):
+                lack = f"has no topic {name} of type {' or '.join(types)} for --topic {role}"
+                raise RecordingError(f"{container.path} {lack}; {found}")
 
         def calibrate(_: str | None) -> tuple[RigCalibration, Sequence[str]]:
             calibration = given.calibration if given else attached_calibration(container)
@@ -235,19 +244,6 @@ def _stream_of(container: Container, channel: Channel) -> Stream | None:
     if channel.encoding != "cdr" or channel.type_name not in {name for names in _TYPES.values() for name in names}:
         return None
     return (ImageStream if channel.type_name in _TYPES["left"] else Stream)(container, channel)
-
-
-def _named(streams: Sequence[Stream], topics: Topics, has_no: str, found: str) -> Roles:
-    """Streams by the names of their topics. RecordingError without the left image, and without a topic that the caller named."""
-    roles = {}
-    for role, types in _TYPES.items():
-        name = getattr(topics, role)
-        there = {stream.channel.topic: stream for stream in streams if stream.channel.type_name in types}
-        if stream := next((there[sent] for sent in transports(name, role) if sent in there), None):
-            roles[role] = [stream]
-        elif role == "left" or (name and name != getattr(Topics(), role)):
-            raise RecordingError(f"{has_no} topic {name} of type {' or '.join(types)} for --topic {role}; {found}")
-    return roles
 
 
 def attached_calibration(container: Container) -> RigCalibration | None:
