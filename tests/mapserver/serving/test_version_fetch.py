@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UnreachableError
-from fleetmap.mapformat.tile import Tile
-from fleetmap.mapformat.tile_codec import decode_tile
+from fleetmap.mapformat.tile import Tile, decode_tile
 from fleetmap.messages import PART_BYTES
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
