@@ -1,6 +1,7 @@
 #include "flow.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -61,6 +62,9 @@ double product(const Window& a, const Window& b) {
   return (total[0] + total[1]) + (total[2] + total[3]);
 }
 
+// Eight numbers, their right neighbours and the next.
+std::array<Eight<float>, 3> three(const float* from) { return {eight(from), eight(from + 1), eight(from + 2)}; }
+
 // The window around (x, y), and its slopes to the right and downwards, which are 0 outside of the image.
 void describe(GreyImage image, double x, double y, int half, Template& window) {
   const int size = 2 * half + 1;
@@ -73,14 +77,19 @@ void describe(GreyImage image, double x, double y, int half, Template& window) {
   for (int v = 0; v < size; ++v) {
     const float *above = wide + v * kWideRow, *here = above + kWideRow, *below = here + kWideRow;
     const bool is_line = top + v >= 0 && top + v < image.height;
-    const ptrdiff_t first = is_line ? std::max<ptrdiff_t>(-left, 0) : size, last = std::min<ptrdiff_t>(image.width - left, size);
-    float* __restrict grey = window.grey + v * kRow, * __restrict right = window.right + v * kRow, * __restrict down = window.down + v * kRow;
-    for (int u = 0; u < kRow; ++u) {
-      grey[u] = here[u + 1];
-      const float along = kThree * (above[u + 2] - above[u] + below[u + 2] - below[u]) + kTen * (here[u + 2] - here[u]);
-      const float across = kThree * (below[u] - above[u] + below[u + 2] - above[u + 2]) + kTen * (below[u + 1] - above[u + 1]);
-      right[u] = u >= first && u < last ? along : 0.0f;
-      down[u] = u >= first && u < last ? across : 0.0f;
+    const int first = is_line ? int(std::max<ptrdiff_t>(-left, 0)) : size, last = int(std::min<ptrdiff_t>(image.width - left, size));
+    for (int u = 0; u < kRow; u += 8) {
+      const auto [a0, a1, a2] = three(above + u);
+      const auto [h0, h1, h2] = three(here + u);
+      const auto [b0, b1, b2] = three(below + u);
+      const Eight<int32_t> column = Eight<int32_t>{0, 1, 2, 3, 4, 5, 6, 7} + u;
+      const auto is_inside = (column >= first) & (column < last);
+      const Eight<float> none = {}, along = kThree * (a2 - a0 + b2 - b0) + kTen * (h2 - h0),
+                         across = kThree * (b0 - a0 + b2 - a2) + kTen * (b1 - a1);
+      const Eight<float> right = is_inside ? along : none, down = is_inside ? across : none;
+      std::memcpy(window.grey + v * kRow + u, &h1, sizeof h1);
+      std::memcpy(window.right + v * kRow + u, &right, sizeof right);
+      std::memcpy(window.down + v * kRow + u, &down, sizeof down);
     }
   }
 }
