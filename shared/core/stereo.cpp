@@ -119,32 +119,54 @@ Peak search(const StereoPair& pair, ptrdiff_t x, ptrdiff_t y, ptrdiff_t first, p
   return peak;
 }
 
-// Brightness between pixels, whole steps apart: `side` rows around (x, y), each of which goes on by `rim` pixels on both sides. All must
-// lie inside.
-void sample(GreyImage image, double x, double y, int half, int rim, double* __restrict samples) {
+// Numbers of a row of samples: whole registers, of which those beyond the wanted ones mean nothing.
+constexpr int stride_of(int half, int rim) { return (2 * (half + rim) + 4) / 4 * 4; }
+constexpr int kMostStride = stride_of(kMostStereoHalf, 1);
+using Samples = double[kMostSide * kMostStride];
+
+// As many pixels as fill whole registers.
+void widen(const uint8_t* __restrict pixels, double* __restrict to, int count) {
+  for (int k = 0; k < (count + 7) / 8 * 8; ++k) to[k] = pixels[k];
+}
+
+void mix(const Bilinear<double>& at, const double* upper, const double* lower, double* __restrict to, int count) {
+  for (int k = 0; k < count; ++k) to[k] = at(upper + k, lower + k);
+}
+
+// Brightness between pixels, whole steps apart: 2 half + 1 rows around (x, y), each of which goes on by `rim` pixels on both sides. All,
+// and a row below, must lie inside.
+void sample(GreyImage image, double x, double y, int half, int rim, Samples& samples) {
   const ptrdiff_t column = ptrdiff_t(x), row = ptrdiff_t(y);
   const Bilinear<double> at(x - double(column), y - double(row));
-  const int columns = 2 * (half + rim) + 1;
-  for (ptrdiff_t v = row - half; v <= row + half; ++v, samples += columns) {
-    const uint8_t *upper = image.row(v) + column - half - rim, *lower = upper + image.width;
-    for (int k = 0; k < columns; ++k) samples[k] = at(upper + k, lower + k);
+  const int columns = 2 * (half + rim) + 1, stride = stride_of(half, rim);
+  double grey[2][kMostStride + 8] = {}, *to = samples;
+  const auto line = [&](ptrdiff_t v) { return grey[v & 1]; };
+  const auto take = [&](ptrdiff_t v) { widen(image.row(v) + column - half - rim, line(v), columns + 1); };
+  take(row - half);
+  for (ptrdiff_t v = row - half; v <= row + half; ++v, to += stride) {
+    take(v + 1);
+    mix(at, line(v), line(v + 1), to, stride);
   }
 }
 
 // Gauss-Newton from a disparity; unknown unless it converges.
 Disparity refine(const StereoPair& pair, double x, double y, double disparity, int half) {
   const double height = double(pair.right.height), width = double(pair.right.width);
-  const int side = 2 * half + 1, area = side * side, stride = side + 2;
+  const int side = 2 * half + 1, area = side * side, stride_l = stride_of(half, 0), stride = stride_of(half, 1);
   if (x - half < 1 || y - half < 1 || x + half + 2 >= width || y + half + 2 >= height) return {};
-  double l[kMostSide * kMostSide], r[kMostSide * (kMostSide + 2)];
+  Samples l, r;
   sample(pair.left, x, y, half, 0, l);
+  const auto for_each_left = [&](const auto& visit) {
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) visit(l[v * stride_l + u]);
+  };
   double mean_l = 0.0, energy = 0.0;
-  for (int n = 0; n < area; ++n) mean_l += l[n];
+  for_each_left([&](double value) { mean_l += value; });
   mean_l /= area;
-  for (int n = 0; n < area; ++n) {
-    l[n] -= mean_l;
-    energy += l[n] * l[n];
-  }
+  for_each_left([&](double& value) {
+    value -= mean_l;
+    energy += value * value;
+  });
   if (energy < area) return {};
   for (int iteration = 0; iteration < kMostIterations; ++iteration) {
     const double x_right = x - disparity;
@@ -156,7 +178,7 @@ Disparity refine(const StereoPair& pair, double x, double y, double disparity, i
         const double value = r[v * stride + u + 1];
         sum_r += value;
         sum_rr += value * value;
-        sum_lr += l[v * side + u] * value;
+        sum_lr += l[v * stride_l + u] * value;
       }
     const double mean_r = sum_r / area, gain = sum_lr / std::max(sum_rr - sum_r * mean_r, 1e-9);
     if (gain < 0.4 || gain > 2.5) return {};
@@ -164,7 +186,7 @@ Disparity refine(const StereoPair& pair, double x, double y, double disparity, i
     for (int v = 0; v < side; ++v)
       for (int u = 0; u < side; ++u) {
         const double* at = r + v * stride + u + 1;
-        const double j = 0.5 * gain * (at[1] - at[-1]), e = l[v * side + u] - gain * (at[0] - mean_r);
+        const double j = 0.5 * gain * (at[1] - at[-1]), e = l[v * stride_l + u] - gain * (at[0] - mean_r);
         sum_jj += j * j;
         sum_je += j * e;
         sum_ee += e * e;
