@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import sqrt
 from statistics import median
 
 import numpy as np
@@ -11,7 +10,7 @@ from fleetmap import core
 from fleetmap.config import Section
 from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import CameraFrame, Image
+from fleetmap.sensors.samples import CameraFrame
 
 _EVERY_PX = 8  # step of the rows and columns that are sampled
 _BRIGHT = 250
@@ -56,16 +55,15 @@ class ImageQualityMonitor:
 
     def judge(self, frame: RectifiedFrame | CameraFrame) -> ImageQuality:
         """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
-        thinned = [_thinned(image) for image in (frame.left, frame.right) if image is not None]
+        images = [np.ascontiguousarray(image) for image in (frame.left, frame.right) if image is not None]
+        thinned = [core.brightness(image, _EVERY_PX, _BRIGHT) for image in images]
         # An image that is bit-identical to the last one: sensor noise never repeats.
         pixels = [image[0] for image in thinned]
         pairs = zip(thinned, self._last, strict=False)
-        self._frozen = [contrast > 1.0 and own == last for (own, _, contrast, _), last in pairs]
+        self._frozen = [contrast > 1.0 and own == last for (own, _, contrast, *_), last in pairs]
         self._last[: len(pixels)] = pixels
-        count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
-        variance = squares / count - (total / count) ** 2
+        (_, mean, contrast, bright_share, variance), settings = thinned[0], self._settings
         typical = median(self._sharpness) if self._sharpness else variance
-        (_, mean, contrast, bright_share), settings = thinned[0], self._settings
         if contrast < settings.dark_contrast:
             cause = Cause.DARK if mean < 128.0 else Cause.GLARE
         elif bright_share > settings.glare_share:
@@ -89,10 +87,3 @@ class ImageQualityMonitor:
             return Cause.OCCLUDED
         self._depths_m.append(scene_depth_m)
         return Cause.NONE
-
-
-def _thinned(image: Image) -> tuple[bytes, float, float, float]:
-    """Return every eighth pixel of every eighth row, with mean, standard deviation and share of nearly white pixels."""
-    pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
-    mean, count = total / len(pixels), len(pixels)
-    return pixels, mean, sqrt(max(squares / count - mean * mean, 0.0)), brights / count

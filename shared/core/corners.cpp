@@ -64,6 +64,15 @@ void score_row(const uint8_t* at, ptrdiff_t stride, ptrdiff_t count, uint8_t thr
   }
 }
 
+// Scores of a row that are higher than all eight neighbours, 0 for others.
+void keep_peaks(const uint8_t* above, const uint8_t* here, const uint8_t* below, uint8_t* __restrict peaks, ptrdiff_t count) {
+  for (ptrdiff_t x = 0; x < count; ++x) {
+    const auto most = [x](const uint8_t* row) { return extreme<true>(extreme<true>(row[x - 1], row[x]), row[x + 1]); };
+    const uint8_t rival = extreme<true>(extreme<true>(most(above), most(below)), extreme<true>(here[x - 1], here[x + 1]));
+    peaks[x] = here[x] > rival ? here[x] : 0;
+  }
+}
+
 // Calls visit(x) for each x from first to last whose byte of the row is not 0.
 template <typename Visit>
 inline void for_each_set(const uint8_t* row, ptrdiff_t first, ptrdiff_t last, const Visit& visit) {
@@ -138,7 +147,7 @@ void CornerFinder::fast(GreyImage image, const CornerLimits& limits, const uint8
   const ptrdiff_t width = image.width, height = image.height;
   if (std::min(width, height) <= 2 * border) return;
   // Scores of three rows: that which is looked through, the one above and the one below.
-  rows_.assign(3 * size_t(width), 0);
+  rows_.assign(3 * size_t(width), 0), peaks_.resize(size_t(width));
   auto scores_of = [&](ptrdiff_t y) { return rows_.data() + (y % 3) * width; };
   auto score = [&](ptrdiff_t y) {
     if (y < kCircleRadius || y >= height - kCircleRadius)
@@ -150,13 +159,10 @@ void CornerFinder::fast(GreyImage image, const CornerLimits& limits, const uint8
   score(border);
   for (ptrdiff_t y = border; y < height - border; ++y) {
     score(y + 1);
-    const uint8_t *above = scores_of(y - 1), *here = scores_of(y), *below = scores_of(y + 1);
-    for_each_set(here, border, width - border, [&](ptrdiff_t x) {
-      const uint8_t s = here[x];
+    keep_peaks(scores_of(y - 1) + border, scores_of(y) + border, scores_of(y + 1) + border, peaks_.data() + border, width - 2 * border);
+    for_each_set(peaks_.data(), border, width - border, [&](ptrdiff_t x) {
       if (free != nullptr && free[y * width + x] == 0) return;
-      if (!limits.clearance.holds(limits.scale * double(x), limits.scale * double(y), limits.scale * limits.clear)) return;
-      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] && s > below[x] &&
-          s > below[x + 1])
+      if (limits.clearance.holds(limits.scale * double(x), limits.scale * double(y), limits.scale * limits.clear))
         found.push_back({float(x), float(y)});
     });
   }
@@ -261,6 +267,12 @@ auto spread_corners(const Image& image, int count, double distance_px, int thres
   return std::tuple(as_numpy<float>(std::move(found.corners)), std::move(found.scores));
 }
 
+int32_t product(const uint8_t* pixels, const int16_t* weights, ptrdiff_t count) {
+  int32_t total = 0;
+  for (ptrdiff_t k = 0; k < count; ++k) total += int16_t(pixels[k]) * weights[k];
+  return total;
+}
+
 // The direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
 // its outermost pixels go on. Source: Rosin 1999, as ORB uses it.
 auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
@@ -271,32 +283,27 @@ auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
   const GreyImage image = grey;
   const Pixel* const places = first(pixels);
   unlocked([&] {
-    std::vector<ptrdiff_t> reach(size_t(radius) + 1);
-    for (int v = 0; v <= radius; ++v) reach[size_t(v)] = ptrdiff_t(std::sqrt(double(radius * radius - v * v)));
+    // Weights of a square's pixels, which are 0 outside of the disc and where rows are filled up to whole registers.
+    const ptrdiff_t side = 2 * ptrdiff_t(radius) + 1, stride = (side + 15) / 16 * 16;
+    std::vector<int16_t> by_x(size_t(side * stride)), by_y(by_x);
+    for (ptrdiff_t v = -radius; v <= radius; ++v) {
+      const ptrdiff_t reach = ptrdiff_t(std::sqrt(double(radius * radius - v * v))), middle = (v + radius) * stride + radius;
+      for (ptrdiff_t u = -reach; u <= reach; ++u) by_x[size_t(middle + u)] = int16_t(u), by_y[size_t(middle + u)] = int16_t(v);
+    }
+    std::vector<uint8_t> extended(static_cast<size_t>(stride));
     for (size_t n = 0; n < count; ++n) {
-      const ptrdiff_t x = whole(places[n].x + 0.5), y = whole(places[n].y + 0.5);
-      const bool is_inside = x >= radius && y >= radius && x < image.width - radius && y < image.height - radius;
+      const ptrdiff_t left = whole(places[n].x + 0.5) - radius, top = whole(places[n].y + 0.5) - radius;
       int64_t moment_x = 0, moment_y = 0;
-      for (ptrdiff_t v = -radius; v <= radius; ++v) {
-        const uint8_t* row = image.row(std::clamp<ptrdiff_t>(y + v, 0, image.height - 1));
-        const ptrdiff_t r = reach[size_t(std::abs(v))];
-        int32_t along = 0, total = 0;
-        if (is_inside) {
-          for (ptrdiff_t u = 0; u <= 2 * r; ++u) {
-            const int32_t value = row[x - r + u];
-            along += int32_t(u) * value;
-            total += value;
-          }
-          along -= int32_t(r) * total;
+      for (ptrdiff_t v = 0; v < side; ++v) {
+        const uint8_t* row = image.row(std::clamp<ptrdiff_t>(top + v, 0, image.height - 1));
+        if (left < 0 || left + stride > image.width) {
+          for (ptrdiff_t u = 0; u < side; ++u) extended[size_t(u)] = row[std::clamp<ptrdiff_t>(left + u, 0, image.width - 1)];
+          row = extended.data();
         } else {
-          for (ptrdiff_t u = -r; u <= r; ++u) {
-            const int32_t value = row[std::clamp<ptrdiff_t>(x + u, 0, image.width - 1)];
-            along += int32_t(u) * value;
-            total += value;
-          }
+          row += left;
         }
-        moment_x += along;
-        moment_y += v * total;
+        moment_x += product(row, by_x.data() + v * stride, stride);
+        moment_y += product(row, by_y.data() + v * stride, stride);
       }
       const double angle = std::fmod(std::atan2(double(moment_y), double(moment_x)) * (180.0 / std::numbers::pi), 360.0);
       degrees[n] = float(angle < 0.0 ? angle + 360.0 : angle);

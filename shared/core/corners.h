@@ -50,7 +50,7 @@ class CornerFinder {
   std::vector<double> eigenvalues_, ordered_;
   std::vector<Held> held_;
   std::vector<int64_t> order_, newest_, chosen_;
-  std::vector<uint8_t> free_, rows_;
+  std::vector<uint8_t> free_, rows_, peaks_;
 };
 
 }  // namespace fleetmap

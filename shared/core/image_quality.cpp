@@ -1,64 +1,50 @@
-// Sums over an image that measure brightness and sharpness; integers, so exact.
+// Brightness and sharpness of an image; by sums of integers, which are exact.
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
+#include <cmath>
 #include <string>
 
 namespace fleetmap {
 namespace {
 
-size_t checked(int every) {
+// Of every n-th row: every n-th pixel, their mean, standard deviation and share of those at least as bright as the limit; and the variance
+// of the steps from pixel to pixel.
+auto brightness(const Image& image, int every, int bright) {
   if (every < 1) throw nb::value_error("every: at least 1");
-  return size_t(every);
-}
-
-// Every n-th pixel of every n-th row; their sum, the sum of their squares, and the number of those at least as bright as the limit.
-auto thin(const Image& image, int every, int bright) {
-  const size_t step = checked(every), height = (image.shape(0) + step - 1) / step, width = (image.shape(1) + step - 1) / step;
+  const size_t step = size_t(every), height = (image.shape(0) + step - 1) / step, width = (image.shape(1) + step - 1) / step;
   std::string thinned(height * width, 0);
-  int64_t total = 0, squares = 0, brighter = 0;
+  int64_t total = 0, squares = 0, brighter = 0, steps = 0, steps_total = 0, steps_squares = 0;
   unlocked([&] {
     uint8_t* to = reinterpret_cast<uint8_t*>(thinned.data());
     const GreyImage from = image;
-    for (ptrdiff_t y = 0; y < from.height; y += every)
+    for (ptrdiff_t y = 0; y < from.height; y += every) {
       for (ptrdiff_t x = 0; x < from.width; x += every) {
         const int64_t value = *to++ = from.row(y)[x];
         total += value;
         squares += value * value;
         brighter += value >= bright;
       }
-  });
-  return std::tuple(nb::bytes(thinned.data(), thinned.size()), total, squares, brighter);
-}
-
-// Number, sum and sum of squares of the steps from pixel to pixel along every n-th row.
-auto row_steps(const Image& image, int every) {
-  constexpr ptrdiff_t kNarrow = 1 << 14;  // number of steps that fit into narrow sums, of which wide registers add many at once
-  int64_t count = 0, total = 0, squares = 0;
-  const ptrdiff_t step_rows = ptrdiff_t(checked(every));
-  unlocked([&] {
-    const GreyImage from = image;
-    for (ptrdiff_t y = 0; y < from.height; y += step_rows)
-      for (ptrdiff_t begin = 0; begin + 1 < from.width; begin += kNarrow) {
-        const uint8_t* const row = from.row(y) + begin;
-        const ptrdiff_t steps = std::min(kNarrow, from.width - 1 - begin);
-        int32_t narrow_total = 0, narrow_squares = 0;
-        for (ptrdiff_t x = 0; x < steps; ++x) {
-          const int32_t step = int32_t(row[x + 1]) - int32_t(row[x]);
-          narrow_total += step;
-          narrow_squares += step * step;
-        }
-        count += steps, total += narrow_total, squares += narrow_squares;
+      const uint8_t* const row = from.row(y);
+      for (ptrdiff_t x = 0; x + 1 < from.width; ++x) {
+        const int64_t rise = int32_t(row[x + 1]) - int32_t(row[x]);
+        steps_squares += rise * rise;
       }
+      if (from.width > 0) steps += from.width - 1, steps_total += int32_t(row[from.width - 1]) - int32_t(row[0]);
+    }
   });
-  return std::tuple(count, total, squares);
+  const auto share = [](int64_t of, int64_t count) { return double(of) / double(count); };
+  const auto variance = [&](int64_t of_squares, int64_t sum, int64_t count) {
+    return share(of_squares, count) - share(sum, count) * share(sum, count);
+  };
+  const int64_t count = int64_t(thinned.size());
+  return std::tuple(nb::bytes(thinned.data(), thinned.size()), share(total, count),
+                    std::sqrt(std::max(variance(squares, total, count), 0.0)), share(brighter, count),
+                    variance(steps_squares, steps_total, steps));
 }
 
 }  // namespace
 
-void bind_image_quality(nb::module_& module) {
-  module.def("thin", &thin, "image"_a, "every"_a, "bright"_a);
-  module.def("row_steps", &row_steps, "image"_a, "every"_a);
-}
+void bind_image_quality(nb::module_& module) { module.def("brightness", &brightness, "image"_a, "every"_a, "bright"_a); }
 
 }  // namespace fleetmap

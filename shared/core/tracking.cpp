@@ -25,6 +25,7 @@ constexpr size_t kDraws = 200;          // find a motion that a third of the poi
 constexpr double kConfidence = 0.999;   // that no camera has more votes than the one that was found
 constexpr double kFewPoints = 0.15;     // share of them that must be missing before corners are looked for
 constexpr int kMostLevels = 30;
+constexpr size_t kLeastStill = 10;  // points that show a still image
 
 struct TrackerModel {
   StereoLens lens;
@@ -80,7 +81,7 @@ size_t agreeing(const std::vector<double>& squared, double gate) {
 // Processes frames in order; ids ascend and never repeat. It keeps its memory.
 class Tracker {
  public:
-  explicit Tracker(const TrackerModel& model) : model_(model) {
+  Tracker(const TrackerModel& model, int64_t first_id) : model_(model), next_id_(first_id) {
     const size_t most = model.max_points;
     for (auto* each : {&pixels_, &points_cam_, &seen_.points, &seen_.pixels, &inliers_.points, &inliers_.pixels}) each->reserve(most);
     for (auto* each : {&starts_, &places_, &back_, &squared_, &left_px_, &prior_px_, &disparities_px_}) each->reserve(2 * most);
@@ -266,7 +267,7 @@ class Tracker {
   TrackerModel model_;
   std::vector<int64_t> ids_;
   std::vector<Vec3> pixels_;
-  int64_t next_id_ = 0;
+  int64_t next_id_;
   Pyramid before_, now_;
   CornerFinder corners_;
   StereoMatcher stereo_;
@@ -296,20 +297,6 @@ GreyImage pictured(const Image& image) {
   return image;
 }
 
-nb::typed<nb::list, nb::ndarray<nb::numpy, uint8_t, nb::ndim<2>>> halvings(const Image& image, int count) {
-  Pyramid pyramid;
-  const size_t levels = checked_levels(count);
-  unlocked([&] { pyramid.set(pictured(image)), pyramid.level(levels); });
-  nb::typed<nb::list, nb::ndarray<nb::numpy, uint8_t, nb::ndim<2>>> halved;
-  for (size_t level = 1; level <= levels; ++level) {
-    const GreyImage of = pyramid.level(level);
-    const size_t height = size_t(of.height), width = size_t(of.width);
-    auto pixels = unlocked([&] { return std::vector<uint8_t>(of.at, of.at + height * width); });
-    halved.append(as_numpy<uint8_t, 2>(std::move(pixels), {height, width}));
-  }
-  return halved;
-}
-
 auto follow_pixels(const Image& before, const Image& now, const Places& pixels, const Places& predicted, int half, int levels,
                    double within_px, double margin_px) {
   const size_t count = pixels.shape(0);
@@ -329,7 +316,7 @@ auto follow_pixels(const Image& before, const Image& now, const Places& pixels, 
 }
 
 void make_tracker(SharedTracker* tracker, const StereoLens& lens, const nb::object& section, const nb::object& stereo,
-                  double max_disparity_px, const Limits& refinement) {
+                  double max_disparity_px, const Limits& refinement, int64_t first_id) {
   constexpr int kThreshold = 12, kBorderPx = 8;
   constexpr int64_t kMostPoints = 100'000;
   const Settings settings{section}, of_pair{stereo};
@@ -344,7 +331,8 @@ void make_tracker(SharedTracker* tracker, const StereoLens& lens, const nb::obje
                                            {kThreshold, kBorderPx, settings["min_distance_px"]},
                                            refinement_of(refinement),
                                            limits,
-                                           of_pair["min_disparity_px"]});
+                                           of_pair["min_disparity_px"]},
+                              first_id);
 }
 
 // Images that a frame can lack: the right one, and both at half size.
@@ -376,8 +364,8 @@ auto track(SharedTracker& tracker, const Image& left, const std::optional<RightA
   return std::tuple(motion, found.kept_share);
 }
 
-// Distances moved by the pixels of each id in both lists, which ascend.
-std::vector<double> common_ways_px(const Indices& old_ids, const Points& old_pixels, const Indices& ids, const Points& pixels) {
+// Of points seen in both images, whose ids ascend; half of an even number may have moved a little.
+bool is_image_still(const Indices& old_ids, const Points& old_pixels, const Indices& ids, const Points& pixels, double limit_px) {
   check_rows(old_ids.shape(0), "old_pixels: one for each id", old_pixels);
   check_rows(ids.shape(0), "pixels: one for each id", pixels);
   std::vector<double> ways;
@@ -389,17 +377,17 @@ std::vector<double> common_ways_px(const Indices& old_ids, const Points& old_pix
     const double u = pixels(n, 0) - old_pixels(k, 0), v = pixels(n, 1) - old_pixels(k, 1);
     ways.push_back(std::sqrt(u * u + v * v));
   }
-  return ways;
+  std::sort(ways.begin(), ways.end());
+  return ways.size() >= kLeastStill && 0.5 * (ways[(ways.size() - 1) / 2] + ways[ways.size() / 2]) < limit_px;
 }
 
 }  // namespace
 
 void bind_tracking(nb::module_& module) {
-  module.def("halvings", &halvings, "image"_a, "count"_a);
   module.def("follow_pixels", &follow_pixels, "before"_a, "now"_a, "pixels"_a, "predicted"_a, "half"_a, "levels"_a, "within_px"_a,
              "margin_px"_a);
   nb::class_<SharedTracker>(module, "Tracker")
-      .def("__init__", &make_tracker, "lens"_a, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
+      .def("__init__", &make_tracker, "lens"_a, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a, "first_id"_a = 0)
       .def("begin", in_turn(+[](SharedTracker& tracker, const Image& image) { unlocked([&] { tracker.begin(pictured(image)); }); }),
            "left"_a)
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.rows(), of.shape(0)); }), "pixels"_a)
@@ -407,7 +395,7 @@ void bind_tracking(nb::module_& module) {
            "clearance_px"_a = nb::none())
       .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return tracker.ids(); }))
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return tracker.pixels(); }));
-  module.def("common_ways_px", &common_ways_px, "old_ids"_a, "old_pixels"_a, "ids"_a, "pixels"_a);
+  module.def("is_image_still", &is_image_still, "old_ids"_a, "old_pixels"_a, "ids"_a, "pixels"_a, "limit_px"_a);
 }
 
 }  // namespace fleetmap

@@ -240,11 +240,8 @@ class Remap:
         """pixels (H, W, 2), shares (H, W): of the result; height, width: of the images."""
     def resample(self, image: _Grey) -> _Grey: ...
 
-def thin(image: _Grey, every: int, bright: int) -> tuple[bytes, int, int, int]:
-    """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""
-
-def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
-    """Number, sum and sum of squares of the steps from pixel to pixel along every n-th row."""
+def brightness(image: _Grey, every: int, bright: int) -> tuple[bytes, float, float, float, float]:
+    """Every n-th pixel of every n-th row: mean, standard deviation, share at least as bright; variance of the rows' steps."""
 
 def pixels_of_rays(rays: _Reals, intrinsics: _Reals, lens: _Reals, reach: float) -> _Reals:
     """(N, 2) pixels of rays (N, 3), NaN without one; the camera as in `register_depth`."""
@@ -462,9 +459,6 @@ def blend_backward(gaussians: _Gaussians, opacities: _Reals, blur_px2: float, sl
 def allocations() -> int:
     """Number of allocations by this thread's calls during computation; results are not counted."""
 
-def halvings(image: _Grey, count: int) -> list[_Grey]:
-    """The image halved once, twice and so on, smoothed: pixel (x, y) is (2x, 2y) in the one before."""
-
 def follow_pixels(
     before: _Grey,
     now: _Grey,
@@ -487,6 +481,7 @@ class Tracker:
         stereo: object,
         max_disparity_px: float,
         refinement: tuple[float, float, tuple[int, int]],
+        first_id: int = 0,
     ) -> None: ...
     def begin(self, left: _Grey) -> None:
         """Forget all points; those added next belong to this frame. Call it before the first `track`."""
@@ -511,8 +506,8 @@ class Tracker:
     ids: _Indices
     pixels: _Reals
 
-def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
-    """Distances moved by the pixels (N, 3) of ids in both lists, which ascend."""
+def is_image_still(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals, limit_px: float) -> bool:
+    """True if most of at least ten points seen in both images, pixels (N, 3), have stayed within the limit; ids ascend."""
 
 def align_features(
     reference: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],

@@ -12,7 +12,7 @@ import pytest
 from support.core_arguments import CALLS, call_of
 
 # Under 50 us for the points of a frame, the clones of a window, the samples of some seconds: few products of small matrices, or copies.
-SHORT = """allocations common_ways_px compose_pose inertial_residual linearise_track longest_gap_ns share_that_passes triangulate
+SHORT = """allocations compose_pose inertial_residual is_image_still linearise_track longest_gap_ns share_that_passes triangulate
     surfel_stride_px velocity_change_rows Filter.__init__ Filter.add_clone Filter.body_covariance Filter.cam_from_earlier
     Filter.correct_by_speed Filter.inflate Filter.inflate_velocity Filter.motion_between Filter.motion_since Filter.nav_state
     Filter.observe Filter.odom_from_body Filter.odom_from_clone Filter.predict_random_walk Filter.remove_clone Filter.return_to_clone

@@ -1,8 +1,10 @@
 """Information of one fix on the mounting of the cameras, by gravity, driving direction and the ground. Pure."""
 
 from bisect import bisect_left
+from cmath import rect
 from collections import deque
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -34,31 +36,27 @@ class WheelTravel:
     """Path of the base by the wheels alone. is_heard: True if wheel samples were received, so that the robot stands on the ground."""
 
     def __init__(self) -> None:
-        self._stamps_ns: deque[int] = deque(maxlen=_KEPT_SAMPLES)
-        self._x_y_yaw: deque[Array] = deque(maxlen=_KEPT_SAMPLES)
+        self._placed: deque[tuple[int, float, float, float]] = deque(maxlen=_KEPT_SAMPLES)  # stamp, x, y, yaw
 
     @property
     def is_heard(self) -> bool:
-        return bool(self._x_y_yaw)
+        return bool(self._placed)
 
     def handle(self, samples: Sequence[WheelSample]) -> None:
         for sample in samples:
-            x_y_yaw = np.zeros(3)
-            if self._x_y_yaw:
-                last, elapsed_s = self._x_y_yaw[-1], (sample.stamp_ns - self._stamps_ns[-1]) * 1e-9
-                turn_rad = sample.yaw_rate_radps * elapsed_s
-                step_m = _turned(sample.velocity_base_mps[:2] * elapsed_s, last[2] + 0.5 * turn_rad)
-                x_y_yaw = last + np.append(step_m, turn_rad)
-            self._stamps_ns.append(sample.stamp_ns)
-            self._x_y_yaw.append(x_y_yaw)
+            last_ns, x_m, y_m, yaw_rad = self._placed[-1] if self._placed else (sample.stamp_ns, 0.0, 0.0, 0.0)
+            elapsed_s = (sample.stamp_ns - last_ns) * 1e-9
+            turn_rad = sample.yaw_rate_radps * elapsed_s
+            x_mps, y_mps = _turned(sample.velocity_base_mps.tolist(), yaw_rad + 0.5 * turn_rad)
+            placed = x_m + elapsed_s * x_mps, y_m + elapsed_s * y_mps, yaw_rad + turn_rad
+            self._placed.append((sample.stamp_ns, *placed))
 
     def at(self, stamp_ns: int) -> Array:
         """Return (3,) x, y in metres and yaw in radians since the first sample; NaN before the oldest kept sample and after the newest."""
-        after = bisect_left(self._stamps_ns, stamp_ns)
-        around = [max(after - 1, 0), min(after, len(self._stamps_ns) - 1)]
-        elapsed_ns = [self._stamps_ns[k] - stamp_ns for k in around]
-        places = np.array([self._x_y_yaw[k] for k in around])
-        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in places.T])
+        after = bisect_left(self._placed, stamp_ns, key=itemgetter(0))
+        around = [self._placed[max(after - 1, 0)], self._placed[min(after, len(self._placed) - 1)]]
+        elapsed_ns = [placed[0] - stamp_ns for placed in around]
+        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in np.array(around).T[1:]])
 
 
 def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Array, Array]:
@@ -81,7 +79,7 @@ def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
     """
     before_from_now = se3_inverse(before.map_from_base) @ now.map_from_base
     turn_rad = float(so3_log(before_from_now[:3, :3])[2])
-    wheels_m = _turned(now.by_wheels[:2] - before.by_wheels[:2], -before.by_wheels[2])
+    wheels_m = _turned((now.by_wheels - before.by_wheels).tolist(), -before.by_wheels[2])
     missing_rad = turn_rad - float(now.by_wheels[2] - before.by_wheels[2])
     step_m = before_from_now[:2, 3]
     length_m = float(np.linalg.norm(step_m))
@@ -93,9 +91,9 @@ def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
     return float((angle + np.pi) % (2 * np.pi) - np.pi), float(sigma)
 
 
-def _turned(vector: Array, by_rad: float) -> Array:
-    cosine, sine = np.cos(by_rad), np.sin(by_rad)
-    return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
+def _turned(vector: Sequence[float], by_rad: float) -> tuple[float, float]:
+    turned = complex(*vector[:2]) * rect(1.0, by_rad)
+    return turned.real, turned.imag
 
 
 def height(base: BasePose, points_map: Array) -> tuple[float, float] | None:

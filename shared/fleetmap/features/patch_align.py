@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +17,8 @@ Pyramid = tuple[Image, Image, Image]
 
 def half_pyramid(image: Image) -> Pyramid:
     """The image and its halvings; a level-0 pixel (x, y) lies at (x, y) / 2^level."""
-    half, quarter = core.halvings(image, 2)
-    return image, half, quarter
+    half = np.asarray(cv2.pyrDown(image), np.uint8)
+    return image, half, np.asarray(cv2.pyrDown(half), np.uint8)
 
 
 class Patches(NamedTuple):

@@ -54,9 +54,6 @@ class DivergenceMonitor:
         self._diverged_frames = 0
 
 
-_MIN_POINTS = 10
-
-
 class ZeroVelocityDetector:
     """Compares each image with the one a window earlier."""
 
@@ -72,17 +69,9 @@ class ZeroVelocityDetector:
         self._images = [image for image in self._images if image[0] >= now_ns - 2 * self._window_ns]
         self._images.append((now_ns, ids, pixels))
         old = [image for image in self._images if image[0] <= now_ns - self._window_ns]
-        if not old or not is_image_still(old[-1][1], old[-1][2], ids, pixels, self._limit_px):
+        if not old or not core.is_image_still(old[-1][1], old[-1][2], ids, pixels, self._limit_px):
             return None
         return old[-1][0], self._images[-2][0]
-
-
-def is_image_still(
-    old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
-) -> bool:
-    """True if most of at least ten points seen in both images, pixels (N, 3), have stayed within the limit; ids ascend."""
-    ways_px = core.common_ways_px(old_ids, old_pixels, ids, pixels)
-    return len(ways_px) >= _MIN_POINTS and middle(ways_px) < limit_px
 
 
 def middle(values: Array) -> float:

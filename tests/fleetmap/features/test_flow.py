@@ -1,7 +1,5 @@
 """Optical flow against OpenCV's and against shifts that are known."""
 
-from itertools import pairwise
-
 import cv2
 import numpy as np
 import pytest
@@ -80,11 +78,3 @@ def test_what_went_wrong_does_not_lead_back() -> None:
     places, inside = core.follow_pixels(before, now, pixels, pixels, 7, 1, 0.5, 35.0)
     expected = ((places > 35.0) & (places < [159 - 35.0, 119 - 35.0])).all(axis=1)
     np.testing.assert_array_equal(inside, held & expected)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (3, 2), (5, 4), (121, 160), (480, 752), (376, 1241)])
-def test_halvings_are_those_of_opencv(size: tuple[int, int]) -> None:
-    """To the bit, also where a picture is narrower than what is mirrored at its edges."""
-    image = np.random.default_rng(sum(size)).integers(0, 256, size, np.uint8)
-    for level, halved in pairwise([image, *core.halvings(image, 3)]):
-        np.testing.assert_array_equal(halved, cv2.pyrDown(level))

@@ -77,11 +77,9 @@ def test_something_before_the_cameras_is_told_by_its_depth() -> None:
     assert judge.judge_depth(3.0) is Cause.NONE
 
 
-def test_sums_are_those_of_numpy() -> None:
+def test_figures_are_those_of_numpy() -> None:
     seen = np.random.default_rng(7).integers(0, 256, (43, 77)).astype(np.uint8)
-    small, total, squares, brights = core.thin(seen, 8, 250)
-    thinned = seen[::8, ::8].astype(np.int64)
-    assert small == seen[::8, ::8].tobytes()
-    assert (total, squares, brights) == (thinned.sum(), (thinned**2).sum(), (thinned >= 250).sum())
-    steps = np.diff(seen[::8].astype(np.int64), axis=1)
-    assert core.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())
+    thinned, *figures = core.brightness(seen, 8, 250)
+    assert thinned == seen[::8, ::8].tobytes()
+    kept, steps = seen[::8, ::8], np.diff(seen[::8].astype(np.int64), axis=1)
+    assert figures == pytest.approx([kept.mean(), kept.std(), (kept >= 250).mean(), steps.var()], rel=1e-12)

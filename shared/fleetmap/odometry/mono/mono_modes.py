@@ -19,7 +19,6 @@ from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode,
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.mono.wheel_mode import WheelMode
 from fleetmap.odometry.odometry import Odometry
-from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
@@ -206,7 +205,7 @@ class MonocularMode(Mode):
         """Track since when the image stands still."""
         self._frame_index = frame_index
         limit_px = self._rig.settings.monocular.still_px
-        if not is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, limit_px):
+        if not core.is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, limit_px):
             self._still_since_ns, self._still_from = None, frame_index
         elif self._still_since_ns is None:
             self._still_since_ns = self.stamp_ns

@@ -94,9 +94,9 @@ class Tracker:
         self._stereo = stereo_settings or StereoSettings()
         self._orb = OrbSettings(count=settings.match_features)
         most_px = stereo.max_disparity_px(camera, self._stereo)
-        self._points = core.Tracker(camera.lens, settings, self._stereo, most_px, REFINEMENT)
+        self._points = core.Tracker(camera.lens, settings, self._stereo, most_px, REFINEMENT, first_id)
         self._previous: RectifiedFrame | None = None
-        self._first_id, self._frame_index = first_id, first_frame - 1
+        self._frame_index = first_frame - 1
         self._memory: list[_Remembered] = []
 
     def track(
@@ -112,24 +112,24 @@ class Tracker:
         if previous is None:
             self._points.begin(frame.left)
             self._step(frame)
-            return Tracked(self._ids(), self._points.pixels, (), None, 1.0, by_descriptors=False)
+            return Tracked(self._points.ids, self._points.pixels, (), None, 1.0, by_descriptors=False)
         if (frame.stamp_ns - previous.stamp_ns) * 1e-9 > self._settings.max_gap_s:
             self._points.begin(frame.left)
             earlier, share = self._rematch(previous, frame, motion_since, rotation_sigma_rad)
             motion = next((e.cam_from_earlier for e in earlier if e.frame_index == self._frame_index - 1), None)
             self._step(frame)
-            return Tracked(self._ids(), self._points.pixels, earlier, motion, share, by_descriptors=True)
+            return Tracked(self._points.ids, self._points.pixels, earlier, motion, share, by_descriptors=True)
         self._memory.clear()
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
         guess, before, points_cam = np.eye(4) if guess is None else guess, None, None
         if self._points_in_camera is not None:
-            before = self._ids()
+            before = self._points.ids
             points_cam = self._points_in_camera(before)
             points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
         solved, share = self._step(frame, guess, is_predicted, points_cam)
         motion, information = solved or (None, None)
-        ids, pixels = self._ids(), self._points.pixels
+        ids, pixels = self._points.ids, self._points.pixels
         if motion is None and before is not None:
             # Without parallax none of the tracked points can be triangulated: they suffice to continue.
             motion = guess if np.isin(ids, before).sum() >= self._settings.min_inliers else None
@@ -138,10 +138,7 @@ class Tracker:
     @property
     def next_id(self) -> int:
         """Number of the next new point."""
-        return self._first_id + self._points.add(np.zeros((0, 3)))
-
-    def _ids(self) -> Ids:
-        return self._points.ids + self._first_id
+        return self._points.add(np.zeros((0, 3)))
 
     def _step(
         self,
@@ -213,7 +210,7 @@ class Tracker:
         depth = transform_points(found.cam_from_source, old.points_cam[a])[:, 2]
         disparity = self._camera.focal_px * self._camera.baseline_m / depth
         fresh = np.column_stack([refined[sure, :2], refined[sure, 0] - disparity])
-        ids = self._first_id + self._points.add(fresh) + np.arange(len(fresh))
+        ids = self._points.add(fresh) + np.arange(len(fresh))
         earlier = np.column_stack([old.features.pixels[a], old.features.pixels[a, 0] - old.disparities[a]])
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
 
