@@ -1,4 +1,5 @@
-// Rows of a self-calibration: observations of a pair of images against their landmarks, whitened, and how they change.
+// Equations of calibrations: rows of observations of a pair of images against their landmarks, whitened, and how they change; and sums of
+// such rows by one frame.
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <cmath>
@@ -122,11 +123,56 @@ auto image_rows(const Array<double, 4>& lens, const SE3& cam_from_body, const Ve
                     as_numpy<double, 3>(std::move(by_calibration), {derived, kRows, width}));
 }
 
+// Hessian and gradient of a pose, a left perturbation of cam_from_map, of a rig's parameters (8,) and its principal point, by matches whose
+// residuals beyond `width` sigmas count less (Source: Geman and McClure 1985). The right camera's focal length, roll and yaw change
+// disparities and rows_px, the rows of the right image.
+auto camera_equations(const Points& points_map, const Points& pixels, const Places& sigmas_px, const Reals& rows_px, const StereoLens& lens,
+                      const SE3& cam_from_map, const Array<double, 8>& parameters, double width) {
+  constexpr size_t kUnknowns = 14;
+  constexpr double kNearestM = 0.3, kRowSigmaPx = 0.2;
+  check_rows(points_map.shape(0), "pixels, sigmas_px, rows_px: one for each point", pixels, sigmas_px, rows_px);
+  std::vector<double> hessian(kUnknowns * kUnknowns), gradient(kUnknowns);
+  const auto [focal, depth, yaw, right_focal, roll, pitch, centre_u, centre_v] = *reinterpret_cast<const double (*)[8]>(parameters.data());
+  const auto robust = [&](double squared) { return std::pow(width * width / (width * width + squared), 2); };
+  unlocked([&] {
+    for (size_t n = 0; n < points_map.shape(0); ++n) {
+      const Vec3 point = cam_from_map * points_map.rows()[n];
+      if (!(point[2] > kNearestM)) continue;
+      const double near = 1.0 / point[2], f = lens.focal, u = f * point[0] * near, v = f * point[1] * near, d = lens.focal_baseline * near;
+      const double right = u - d, across = right * v / f, u_seen = pixels(n, 0), v_seen = pixels(n, 1);
+      const double off[kRows] = {(1 + focal) * u + lens.cx + centre_u - u_seen, (1 + focal) * v + lens.cy + centre_v - v_seen,
+                                 (1 + focal) * (1 + depth) * d + yaw * (f + right * right / f) - right_focal * right + roll * v -
+                                     pitch * across - (u_seen - pixels(n, 2)),
+                                 right_focal * v + roll * right + pitch * (f + v * v / f) - yaw * across - rows_px(n)};
+      double rows[kRows][kUnknowns] = {{0, 0, 0, 0, 0, 0, u, 0, 0, 0, 0, 0, 1, 0},
+                                       {0, 0, 0, 0, 0, 0, v, 0, 0, 0, 0, 0, 0, 1},
+                                       {0, 0, 0, 0, 0, 0, d, d, f + right * right / f, -right, v, -across, 0, 0},
+                                       {0, 0, 0, 0, 0, 0, 0, 0, -across, v, right, f + v * v / f, 0, 0}};
+      const Vec3 by_point[3] = {{f * near, 0.0, -u * near}, {0.0, f * near, -v * near}, {0.0, 0.0, -d * near}};
+      for (size_t row = 0; row < 3; ++row) store(cross(point, by_point[row]), rows[row]), store(by_point[row], rows[row] + 3);
+      const double scales[kRows] = {1.0 / sigmas_px(n, 0), 1.0 / sigmas_px(n, 0), 1.0 / sigmas_px(n, 1), 1.0 / kRowSigmaPx};
+      const auto squared = [&](size_t row) { return off[row] * off[row] * scales[row] * scales[row]; };
+      const double of_left = robust(squared(0) + squared(1));
+      for (size_t row = 0; row < kRows; ++row) {
+        if (!std::isfinite(off[row])) continue;
+        const double weight = scales[row] * scales[row] * of_left * (row < 2 ? 1.0 : robust(squared(row)));
+        for (size_t a = 0; a < kUnknowns; ++a) {
+          gradient[a] -= weight * rows[row][a] * off[row];
+          for (size_t b = 0; b < kUnknowns; ++b) hessian[kUnknowns * a + b] += weight * rows[row][a] * rows[row][b];
+        }
+      }
+    }
+  });
+  return std::tuple(as_numpy<double, 2>(std::move(hessian), {kUnknowns, kUnknowns}), std::move(gradient));
+}
+
 }  // namespace
 
 void bind_image_rows(nb::module_& module) {
   module.def("image_rows", &image_rows, "lens"_a, "cam_from_body"_a, "right_m"_a, "map_from_body"_a, "points_map"_a, "obs_keyframe"_a,
              "obs_landmark"_a, "measured"_a, "as_given"_a, "sigmas"_a, "slopes"_a.none());
+  module.def("camera_equations", &camera_equations, "points_map"_a, "pixels"_a, "sigmas_px"_a, "rows_px"_a, "lens"_a, "cam_from_map"_a,
+             "parameters"_a, "width"_a);
 }
 
 }  // namespace fleetmap

@@ -602,6 +602,18 @@ def image_rows(
     baseline and its direction; columns (7,) of turn, shift, time offset, focal ratio and those three; 1 plus the focal ratio.
     """
 
+def camera_equations(
+    points_map: _Reals,
+    pixels: _Reals,
+    sigmas_px: _Reals,
+    rows_px: _Reals,
+    lens: _Reals,
+    cam_from_map: _Reals,
+    parameters: _Reals,
+    width: float,
+) -> tuple[_Reals, _Reals]:
+    """Hessian (14, 14) and gradient of a pose and `parameters` (8,), as of `camera_view`, by matches of a frame as of Correspondences."""
+
 class BundleSolver:
     """Bundle adjustment of K keyframes, N landmarks, M observations.
 

@@ -14,7 +14,7 @@ _POSE = 6
 _CENTRE_SIGMA_PX = 1.0  # of the principal point, which is not distinguishable from a rotation of the rig
 # Widths of the robust weight in sigmas, one for each iteration: a wrong calibration shifts all disparities at once.
 _WIDTHS = (30.0, 6.0, 3.0)
-_ROW_POINTS, _ROW_WINDOW_PX, _ROW_BACK_PX, _ROW_SIGMA_PX = 40, 11, 0.5, 0.2
+_ROW_POINTS, _ROW_WINDOW_PX, _ROW_BACK_PX = 40, 11, 0.5
 _MIN_POINTS = 15
 _NEAREST_M = 0.3
 
@@ -62,8 +62,10 @@ def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -
     prior = np.zeros(_POSE + IMAGE + 2)
     prior[-2:] = _CENTRE_SIGMA_PX**-2
     hessian = np.zeros((len(prior), len(prior)))
+    points, pixels = np.ascontiguousarray(matched.points_source), np.ascontiguousarray(matched.pixels)
+    seen = points, pixels, np.ascontiguousarray(matched.sigmas_px), np.ascontiguousarray(rows_px), matched.camera.lens
     for width in _WIDTHS:
-        hessian, gradient = _normal_equations(matched, rows_px, cam_from_map, theta, width)
+        hessian, gradient = core.camera_equations(*seen, np.ascontiguousarray(cam_from_map), theta, width)
         gradient[_POSE:] -= prior[_POSE:] * theta
         hessian[range(len(prior)), range(len(prior))] += prior
         try:
@@ -82,66 +84,3 @@ def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -
     if not (np.isfinite(theta).all() and np.isfinite(information).all()):
         return None
     return CameraView(information, information @ theta[:IMAGE], shift)
-
-
-def _normal_equations(
-    matched: Correspondences, rows_px: Array, cam_from_map: Array, theta: Array, width: float
-) -> tuple[Array, Array]:
-    """Return Hessian and gradient of pose (a left perturbation), parameters and principal point, with Geman-McClure weights.
-
-    The right camera's focal length, roll and yaw change disparities and the rows of the right image.
-    """
-    focal_px, cx_px, cy_px, _ = lens = matched.camera.lens
-    x, y, z = transform_points(cam_from_map, matched.points_source).T
-    is_before = z > _NEAREST_M
-    near = 1.0 / np.where(is_before, z, 1.0)
-    u, v, disparity = focal_px * x * near, focal_px * y * near, lens[3] * near
-    focal, depth, yaw, right_focal, roll, pitch, centre_u, centre_v = theta
-    right = u - disparity
-    across = right * v / focal_px
-    u_seen, v_seen, right_seen = matched.pixels.T
-    has_depth = np.isfinite(right_seen) & is_before
-    has_row = np.isfinite(rows_px) & is_before
-    residuals = np.stack(
-        [
-            (1 + focal) * u + cx_px + centre_u - u_seen,
-            (1 + focal) * v + cy_px + centre_v - v_seen,
-            (1 + focal) * (1 + depth) * disparity
-            + yaw * (focal_px + right * right / focal_px)
-            - right_focal * right
-            + roll * v
-            - pitch * across
-            - (u_seen - right_seen),
-            right_focal * v + roll * right + pitch * (focal_px + v * v / focal_px) - yaw * across - rows_px,
-        ],
-        axis=1,
-    )
-    count, zero = len(x), np.zeros(len(x))
-    jacobian = np.zeros((count, 4, _POSE + IMAGE + 2))
-    by_point = np.zeros((count, 3, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = focal_px * near
-    by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -u * near, -v * near, -disparity * near
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(count, 3, 3)  # d(point) / d(turn)
-    jacobian[:, :3, :3] = by_point @ turned
-    jacobian[:, :3, 3:_POSE] = by_point
-    of = jacobian[:, :, _POSE:]
-    of[:, 0, 0], of[:, 1, 0], of[:, 2, 0] = u, v, disparity
-    of[:, 2, 1], of[:, 2, 2], of[:, 2, 3] = disparity, focal_px + right * right / focal_px, -right
-    of[:, 2, 4], of[:, 2, 5] = v, -across
-    of[:, 3, 2], of[:, 3, 3], of[:, 3, 4], of[:, 3, 5] = -across, v, right, focal_px + v * v / focal_px
-    of[:, 0, IMAGE] = of[:, 1, IMAGE + 1] = 1.0
-    weights = 1.0 / matched.sigmas_px
-    scale = np.stack([weights[:, 0], weights[:, 0], weights[:, 1], np.full(count, 1 / _ROW_SIGMA_PX)], axis=1)
-    scaled = np.nan_to_num(residuals) * scale
-    of_left = _robust((scaled[:, :2] ** 2).sum(axis=1), width) * is_before
-    of_right = of_left * _robust(scaled[:, 2] ** 2, width) * has_depth
-    of_row = of_left * _robust(scaled[:, 3] ** 2, width) * has_row
-    robust = np.stack([of_left, of_left, of_right, of_row], axis=1)
-    rows = (jacobian * scale[:, :, None]).reshape(4 * count, -1)
-    weighted = rows * robust.reshape(-1, 1)
-    return np.asarray(rows.T @ weighted), np.asarray(-weighted.T @ scaled.ravel())
-
-
-def _robust(squared: Array, width: float) -> Array:
-    """Return the weight of a squared normalized residual. Source: Geman and McClure 1985."""
-    return np.asarray((width * width / (width * width + squared)) ** 2)
