@@ -111,7 +111,8 @@ class Perception:
         judged_s = self._clock()
         odometry = self.odometry.handle_stereo(followed)
         if image.cause is Cause.NONE:
-            image = replace(image, cause=self._images[number].judge_depth(odometry.scene_depth_m))
+            cause = self._images[number].judge_depth(odometry.scene_depth_m)
+            image = image if cause is Cause.NONE else replace(image, cause=cause)
         self.stage_s = {"image_quality": judged_s - begun_s, "odometry": self._clock() - judged_s}
         causes = [image.cause if k == number else each.cause for k, each in enumerate(images)]
         last = self.percept

@@ -1,7 +1,7 @@
 """Information of one fix on the mounting of the cameras, by gravity, driving direction and the ground. Pure."""
 
 from bisect import bisect_left
-from cmath import rect
+from cmath import phase, rect
 from collections import deque
 from collections.abc import Sequence
 from operator import itemgetter
@@ -36,7 +36,7 @@ class WheelTravel:
     """Path of the base by the wheels alone. is_heard: True if wheel samples were received, so that the robot stands on the ground."""
 
     def __init__(self) -> None:
-        self._placed: deque[tuple[int, float, float, float]] = deque(maxlen=_KEPT_SAMPLES)  # stamp, x, y, yaw
+        self._placed: deque[tuple[int, complex, float]] = deque(maxlen=_KEPT_SAMPLES)  # stamp, x + iy in metres, yaw
 
     @property
     def is_heard(self) -> bool:
@@ -44,19 +44,19 @@ class WheelTravel:
 
     def handle(self, samples: Sequence[WheelSample]) -> None:
         for sample in samples:
-            last_ns, x_m, y_m, yaw_rad = self._placed[-1] if self._placed else (sample.stamp_ns, 0.0, 0.0, 0.0)
+            last_ns, place_m, yaw_rad = self._placed[-1] if self._placed else (sample.stamp_ns, 0j, 0.0)
             elapsed_s = (sample.stamp_ns - last_ns) * 1e-9
             turn_rad = sample.yaw_rate_radps * elapsed_s
-            x_mps, y_mps = _turned(sample.velocity_base_mps.tolist(), yaw_rad + 0.5 * turn_rad)
-            placed = x_m + elapsed_s * x_mps, y_m + elapsed_s * y_mps, yaw_rad + turn_rad
-            self._placed.append((sample.stamp_ns, *placed))
+            way_m = elapsed_s * complex(*sample.velocity_base_mps[:2]) * rect(1.0, yaw_rad + 0.5 * turn_rad)
+            self._placed.append((sample.stamp_ns, place_m + way_m, yaw_rad + turn_rad))
 
     def at(self, stamp_ns: int) -> Array:
         """Return (3,) x, y in metres and yaw in radians since the first sample; NaN before the oldest kept sample and after the newest."""
         after = bisect_left(self._placed, stamp_ns, key=itemgetter(0))
         around = [self._placed[max(after - 1, 0)], self._placed[min(after, len(self._placed) - 1)]]
         elapsed_ns = [placed[0] - stamp_ns for placed in around]
-        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in np.array(around).T[1:]])
+        places = np.array([(place_m.real, place_m.imag, yaw_rad) for _, place_m, yaw_rad in around])
+        return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in places.T])
 
 
 def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Array, Array]:
@@ -79,21 +79,16 @@ def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
     """
     before_from_now = se3_inverse(before.map_from_base) @ now.map_from_base
     turn_rad = float(so3_log(before_from_now[:3, :3])[2])
-    wheels_m = _turned((now.by_wheels - before.by_wheels).tolist(), -before.by_wheels[2])
+    wheels_m = complex(*(now.by_wheels - before.by_wheels)[:2]) * rect(1.0, -before.by_wheels[2])
     missing_rad = turn_rad - float(now.by_wheels[2] - before.by_wheels[2])
     step_m = before_from_now[:2, 3]
     length_m = float(np.linalg.norm(step_m))
-    if abs(turn_rad) > _MAX_TURN_RAD or not _MIN_STEP_M < length_m < 2 * float(np.linalg.norm(wheels_m)):
+    if abs(turn_rad) > _MAX_TURN_RAD or not _MIN_STEP_M < length_m < 2 * abs(wheels_m):
         return None
-    angle = np.arctan2(wheels_m[1], wheels_m[0]) - np.arctan2(step_m[1], step_m[0]) + 0.5 * missing_rad
+    angle = phase(wheels_m) - np.arctan2(step_m[1], step_m[0]) + 0.5 * missing_rad
     variances = [end.cov_rot_trans[3:5, 3:5].trace() / 2 for end in (before, now)]
     sigma = np.hypot(np.sqrt(sum(variances)) / length_m, missing_rad / np.sqrt(12))  # uniform from one end to the other
     return float((angle + np.pi) % (2 * np.pi) - np.pi), float(sigma)
-
-
-def _turned(vector: Sequence[float], by_rad: float) -> tuple[float, float]:
-    turned = complex(*vector[:2]) * rect(1.0, by_rad)
-    return turned.real, turned.imag
 
 
 def height(base: BasePose, points_map: Array) -> tuple[float, float] | None:

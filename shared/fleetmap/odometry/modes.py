@@ -188,7 +188,7 @@ class WindowMode(Mode):
             "inertial": self.inertial,
             "imu_minus_cam_s": self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0,
             "imu_minus_cam_sigma_s": window_filter.offset_sigma_s if self.inertial else np.inf,
-            "previous_from_body": self.window.body_since(frame_index - 1) if frame_index else None,
+            "previous_from_body": self.window.previous_from_body,
             "is_bridged": self.is_bridged,
         }
 
@@ -541,7 +541,7 @@ class InertialMode(WindowMode):
             return self._begin_again(frame_index, tracked)._replace(used=used)
         moved = (
             window.filter.odom_from_body(),
-            None if self.is_bridged else window.body_since(frame_index - 1),
+            None if self.is_bridged else window.previous_from_body,
             float(np.sqrt(window.filter.velocity_covariance[2, 2])),
         )
         is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)

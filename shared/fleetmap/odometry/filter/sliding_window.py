@@ -41,6 +41,9 @@ class SlidingWindow:
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
         self.contradicts_images = False
+        self.previous_from_body: Array | None = (
+            None  # the motion since the frame before, as known after the last update
+        )
         self._judged = deque[tuple[int, int]](maxlen=_JUDGED_UPDATES)  # numbers of accepted and refused tracks
         self._refused_frames = 0  # in a row in which the filter refused tracks and accepted none
         settings = rig.settings.filter
@@ -71,14 +74,6 @@ class SlidingWindow:
         kept_from_now, covariance = self.filter.motion_since(kept)
         carry = se3_adjoint(frame_from_kept)
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
-
-    def body_since(self, frame_index: int) -> Array | None:
-        """The transform of `motion_since` alone."""
-        ids = self.filter.clone_ids
-        if frame_index in ids:
-            return self.filter.motion_between(frame_index, ids[-1])
-        found = self.motion_since(frame_index)
-        return None if found is None else found[0]
 
     def _kept(self, frame_index: int) -> tuple[int, Array]:
         """The kept frame that represents a dropped one, and frame_from_kept (4, 4); for a kept frame itself."""
@@ -141,6 +136,11 @@ class SlidingWindow:
         # Or each of few tracks was due once.
         self.contradicts_images = takes_few or self._refused_frames >= chunk_frames
         self._prune()
+        kept, previous_from_kept = self._kept(frame_index - 1)
+        is_known = kept in self.filter.clone_ids
+        self.previous_from_body = (
+            previous_from_kept @ self.filter.motion_between(kept, frame_index) if is_known else None
+        )
         return used
 
     def _add_clone(self, frame_index: int) -> None:
