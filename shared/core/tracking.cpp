@@ -364,7 +364,7 @@ auto track(SharedTracker& tracker, const Image& left, const std::optional<RightA
   return std::tuple(motion, found.kept_share);
 }
 
-// Of points seen in both images, whose ids ascend; half of an even number may have moved a little.
+// True if points seen in both images, whose ids ascend, are enough, and the median of their ways is below the limit.
 bool is_image_still(const Indices& old_ids, const Points& old_pixels, const Indices& ids, const Points& pixels, double limit_px) {
   check_rows(old_ids.shape(0), "old_pixels: one for each id", old_pixels);
   check_rows(ids.shape(0), "pixels: one for each id", pixels);
