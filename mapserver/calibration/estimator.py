@@ -6,10 +6,12 @@ Sources: Triggs et al. 2000, Bundle adjustment, a modern synthesis; Förstner an
 components.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fleetmap.core import BundleSolver
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import ImuNoise
 from mapserver.calibration.image_rows import Fixed, Measured, Observations, image_rows
@@ -88,8 +90,10 @@ def adjust(data: CalibrationData) -> Adjusted:
             problem.slopes = problem.seen.measured_slopes(theta)
         problem.prepare(state, theta, scales)
         theta, state = problem.descend(theta, state, _TOLERANCE if last else _ROUGH_TOLERANCE)
-        # Redundancies follow from what was observed, and from scales only by their ratios: every other round is enough.
-        squares, redundancy = problem.variance_components(theta, state, None if round_number % 2 == 0 else redundancy)
+        # Redundancies follow from what was observed, and from scales only by their ratios: every other round is enough, the last one for
+        # the IMU, whose noise is reported.
+        asked = (3, 4) if last else range(6) if round_number % 2 == 0 else ()
+        squares, redundancy = problem.variance_components(theta, state, redundancy, asked)
         if not last:
             scales = scales.corrected(squares, redundancy)
     information = problem.calibration_information(theta, state)
@@ -148,8 +152,10 @@ class Problem:
             self.measured = theta, self.seen.measured(theta)
         return image_rows(self.seen, self.data, state, *self.measured, self.scales.images, fixed)
 
-    def bundle(self, theta: Array, state: MotionState, shares: Array, rows: ImageRows | None = None) -> BundleProblem:
-        """Return the adjustment at theta and `state`, with `rows` linearised there; each kind of motion is weighted by shares (3,)."""
+    def bundle(
+        self, theta: Array, state: MotionState, shares: Array, rows: Callable[..., ImageRows] | None = None
+    ) -> BundleProblem:
+        """Return the adjustment at theta and `state`, by default with its own rows; each kind of motion is weighted by shares (3,)."""
         rotation, motion, way = shares.tolist()
         inertial, data = None, self.data
         if data.is_inertial:
@@ -174,7 +180,7 @@ class Problem:
                 self.prior,
                 np.array([edge.way_m for edge in self.wheels]).reshape(-1, 3),
                 INDEX[CalibrationParameter.WHEEL_SCALE],
-                self.rows if rows is None else lambda *_: rows,
+                rows or self.rows,
             ),
         )
 
@@ -197,9 +203,11 @@ class Problem:
         norm = np.linalg.norm(rows[np.isfinite(self.seen.row_sigmas[:, 0])], axis=1)
         return ErrorScales(np.full(4, max(1.0, float(np.median(norm)) / _MEDIAN_NORM) if len(norm) else 1.0))
 
-    def variance_components(self, theta: Array, state: MotionState, known: Array | None = None) -> tuple[Array, Array]:
-        """(6,) sums of squares of pixels, disparities, row differences, gyro, accelerometer and wheels along the way, and redundancies,
-        measured unless they are known.
+    def variance_components(
+        self, theta: Array, state: MotionState, known: Array, asked: Sequence[int]
+    ) -> tuple[Array, Array]:
+        """(6,) sums of squares of pixels, disparities, row differences, gyro, accelerometer and wheels along the way, and redundancies:
+        measured of those asked, of the others as known (6,).
 
         A redundancy is n - tr(H^-1 H_g) of n residuals that give H_g to the information H (Förstner and Wrobel 2016); the trace is how log
         det H grows with the share of H_g.
@@ -217,15 +225,18 @@ class Problem:
         kinds = felt[:, :3], felt[:, 3:9], rolled
         squares = np.array([sums[0] + sums[1], *sums[2:], *((kind**2).sum() for kind in kinds)])
         numbers = np.array([counted[:2].sum(), counted[2].sum(), counted[3].sum(), *(kind.size for kind in kinds)])
-        if known is not None:
-            return squares, known
-        redundancy, alone = numbers.astype(np.float64), self._log_determinant(theta, state, rows, np.ones(6))
-        for kind in np.flatnonzero(numbers):
-            grown = self._log_determinant(theta, state, rows, 1.0 + _SHARE * (np.arange(6) == kind))
-            redundancy[kind] -= (grown - alone) / np.log1p(_SHARE)
-        return squares, redundancy
+        redundancy, asked, weighted = known.copy(), [kind for kind in asked if numbers[kind]], rows
 
-    def _log_determinant(self, theta: Array, state: MotionState, rows: ImageRows, shares: Array) -> float:
-        """Return it for the information of all unknowns, with the kinds weighted by shares (6,)."""
-        scaled = rows._replace(shares=shares[[0, 0, 1, 2]])
-        return solver_of(self.bundle(theta, state, shares[3:], scaled), SETTINGS).log_determinant()
+        def solver(motions: Array) -> BundleSolver:
+            return solver_of(self.bundle(theta, state, motions, lambda *_: weighted), SETTINGS)
+
+        if not asked:
+            return squares, redundancy
+        as_is = solver(np.ones(3))
+        alone = as_is.log_determinant()
+        for kind in asked:
+            shares = 1.0 + _SHARE * (np.arange(6) == kind)
+            weighted = rows._replace(shares=shares[[0, 0, 1, 2]])
+            grown = (as_is if kind < 3 else solver(shares[3:])).log_determinant()
+            redundancy[kind] = numbers[kind] - (grown - alone) / np.log1p(_SHARE)
+        return squares, redundancy

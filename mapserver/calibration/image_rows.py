@@ -35,14 +35,16 @@ _LEFT_LENS = {
     INDEX[P.FOCAL],
     INDEX[P.PRINCIPAL_X],
     INDEX[P.PRINCIPAL_Y],
-    *range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION),
+    *range(len(COLUMNS), len(COLUMNS) + DISTORTION),
 }
 # Step sizes of the numerical derivatives of the measurements: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PAIR_ROLL]), 1e-5)
-_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION), 1e-5)
+_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + DISTORTION), 1e-5)
 _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.01)
+_BOTH = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
+_DIFFERENCE = slice(_BOTH.stop, _BOTH.stop + DISTORTION)
 _PLACE = [INDEX[p] for p in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z)]
 _TURN = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
 _SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
@@ -151,26 +153,30 @@ class Observations:
         A ray whose raw pixel a change of the lens would move has to move back for the pixel to stay: no lens is inverted anew. Source: the
         theorem of implicit functions.
         """
-        pair, count = self.pair(theta), len(self.left_px)
-        places = self._rectified(theta, pair)
-        slopes = Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS)))
-        by_raw = [
-            _inverse(self._raw_by_rectified(place, theta, pair, n))
-            for n, place in enumerate(places[: len(self.axes.rect_from_cam)])
-        ]
+        pair = self.pair(theta)
+        places = self._rectified(theta, pair)[: len(self.axes.rect_from_cam)]
+        raw = [self._raw(n, place, theta, pair) for n, place in enumerate(places)]
+        by_rectified = [self._raw_by_rectified(place, theta, pair, n) for n, place in enumerate(places)]
+        by_raw, as_given = [_inverse(each) for each in by_rectified], self._as_given(by_rectified[0])
+        slopes = Measured(np.zeros((len(raw[0]), 4, UNKNOWNS)), np.zeros((len(raw[0]), 2, 2, UNKNOWNS)))
         for column, size in _LENS_STEPS.items():
-            ends = [(theta + sign * size * (np.arange(UNKNOWNS) == column), sign * size) for sign in (1, -1)]
-            moves = []
-            for number, (place, turn) in enumerate(zip(places, by_raw, strict=False)):
-                more, less = (self._raw(number, place, end, pair) for end, _ in ends)
-                moves.append(_product(turn, (less - more)[:, :, None])[..., 0] / (2.0 * size))
-            change = np.column_stack([moves[0], moves[0] - moves[-1]])
-            slopes.rows[..., column] = np.where(np.isfinite(change), change, 0.0)
+            end = theta + size * (np.arange(UNKNOWNS) == column)
+            changes = [
+                before - self._raw(n, place, end, pair)
+                for n, (place, before) in enumerate(zip(places, raw, strict=True))
+            ]
+            moves = [
+                _product(turn, each[:, :, None])[..., 0] / size for turn, each in zip(by_raw, changes, strict=True)
+            ]
+            slopes.rows[..., column] = np.column_stack([moves[0], moves[0] - moves[-1]])
             if column in _LEFT_LENS:
-                more, less = (
-                    self._as_given(self._raw_by_rectified(places[0] + step * moves[0], end, pair)) for end, step in ends
-                )
-                slopes.as_given[..., column] = (more - less) / (2.0 * size)
+                seen = self._raw_by_rectified(places[0] + size * moves[0], end, pair)
+                slopes.as_given[..., column] = (self._as_given(seen) - as_given) / size
+        # A difference of the two lenses is half a change of both, backwards on the left.
+        left, apart = slopes.rows[:, :2, _BOTH], slopes.rows[:, 2:, _BOTH]
+        slopes.rows[..., _DIFFERENCE] = np.concatenate([-0.5 * left, 0.5 * apart - left], axis=1)
+        slopes.as_given[..., _DIFFERENCE] = -0.5 * slopes.as_given[..., _BOTH]
+        slopes.rows[~np.isfinite(slopes.rows)] = 0.0
         return slopes
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_exps, so3_log
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated, imu_intervals, preintegrate
 from fleetmap.sensors.calibration import ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -152,13 +152,12 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
         if len(samples) < 2 or (samples[-1].stamp_ns - samples[0].stamp_ns) * 1e-9 < 0.7 * dt_s:
             continue
         turn = so3_log(state.map_from_body[k, :3, :3].T @ state.map_from_body[k + 1, :3, :3])
-        shares = _shares([sample.stamp_ns for sample in samples], int(stamps[k]), int(stamps[k + 1]))
-        way, variance = np.zeros(3), 0.0
-        for sample, (at, share) in zip(samples, shares, strict=True):
-            way += share * dt_s * so3_exp(turn * at) @ base_from_body[:3, :3].T @ sample.velocity_base_mps
-            variance += (share * dt_s * sample.sigma_mps) ** 2
+        at, share = _shares([sample.stamp_ns for sample in samples], int(stamps[k]), int(stamps[k + 1])).T
+        ways = np.array([sample.velocity_base_mps for sample in samples]) @ base_from_body[:3, :3]
+        way = dt_s * share @ (so3_exps(at[:, None] * turn) @ ways[:, :, None])[..., 0]
+        sigma_m = float(np.linalg.norm(dt_s * share * [sample.sigma_mps for sample in samples]))
         # the base moves by R v; the body also by the rotation of the lever between them
-        sigma = np.array([scale * np.sqrt(variance), _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
+        sigma = np.array([scale * sigma_m, _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
         turned = base_from_body[:3, :3] @ so3_exp(-0.5 * turn)
         edges.append(WheelEdge(k, way, base_in_body - so3_exp(turn) @ base_in_body, turned / sigma[:, None]))
     return edges

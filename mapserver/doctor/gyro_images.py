@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
+from fleetmap.geometry import AnyArray, Array, rotation_angle_rad, rotation_between_vectors
 from fleetmap.odometry.gyro_clock import turned_between
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words, in_axes
 from fleetmap.sensors.samples import ImuSamples
@@ -87,22 +87,22 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     """
     offsets_s = np.arange(-_SEARCH_S, _SEARCH_S + _STEP_S / 2, _STEP_S)
     all_seen = turns.rates_body_radps
-    all_gyro = np.stack([_gyro_rates(turns, imu, imu_minus_cam_s + d) for d in offsets_s])
+    all_gyro = _gyro_rates(turns, imu, imu_minus_cam_s + offsets_s)
     kept = np.ones(len(all_seen), bool)
     for _ in range(2):
-        seen, gyro = all_seen[kept] - all_seen[kept].mean(axis=0), all_gyro[:, kept]
-        speeds = np.linalg.norm(all_seen[kept], axis=1)
-        offset = int(np.argmax([correlation(np.linalg.norm(rates, axis=1), speeds) for rates in gyro]))
+        seen, gyro = all_seen[kept], all_gyro[:, kept]
+        speeds = (np.linalg.norm(rates, axis=-1, keepdims=True) for rates in (gyro, seen))
+        offset, shared = int(np.argmax(_correlated(*speeds))), _correlated(gyro, seen)
         for _ in range(3):
-            body_from_gyro, _ = _axes(seen, gyro[offset])
-            scores = _scores(gyro, seen, body_from_gyro)
+            body_from_gyro, _ = _axes(shared[offset])
+            scores = (shared * body_from_gyro).sum(axis=(1, 2))
             offset = int(np.argmax(scores))
-        body_from_gyro, axes_seen = _axes(seen, gyro[offset])
+        body_from_gyro, axes_seen = _axes(shared[offset])
         inliers = _inliers(all_seen, all_gyro[offset] @ body_from_gyro.T)
         if inliers.all():
             break
         kept = inliers
-    centred = gyro[offset] - gyro[offset].mean(axis=0)
+    seen, centred = (rates - rates.mean(axis=0) for rates in (seen, gyro[offset]))
     turned = centred @ body_from_gyro.T
     scale = float((turned * turned).sum() / max((turned * seen).sum(), 1e-12))
     most = 2.0 * (float(((turned / scale - seen) ** 2).sum()) + _AS_WELL * float((seen**2).sum()))
@@ -110,17 +110,25 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     signed = max(good, key=lambda axes: float(np.trace(axes)), default=None)
     parts = []
     for part in np.array_split(np.arange(len(all_seen)), _PARTS):
-        shown = _scores(all_gyro[:, part], all_seen[part], body_from_gyro)
         spread = float(np.sqrt(all_seen[part].var(axis=0).sum()))
-        if len(part) >= _MIN_PAIRS and spread > _LEAST_RATE_RADPS and shown.max() > _SURE_CORRELATION:
+        if len(part) < _MIN_PAIRS or spread <= _LEAST_RATE_RADPS:
+            continue
+        shown = (_correlated(all_gyro[:, part], all_seen[part]) * body_from_gyro).sum(axis=(1, 2))
+        if shown.max() > _SURE_CORRELATION:
             parts.append(_peak(offsets_s, shown, int(np.argmax(shown))))
     best_s = _peak(offsets_s, scores, offset)
     return GyroFit(best_s, body_from_gyro, scale, float(scores[offset]), axes_seen, signed, np.array(parts))
 
 
-def _scores(gyro: Array, seen: Array, body_from_gyro: Array) -> Array:
-    """Return the correlation of the gyro's rates at every offset (D, K, 3) with the images' rates (K, 3)."""
-    return np.array([correlation(rates @ body_from_gyro.T, seen) for rates in gyro])
+def _correlated(gyro: Array, seen: Array) -> Array:
+    """Return (D, k, k) at every offset the correlation of each column of the images' (K, k) with each of the gyro's (D, K, k).
+
+    The sum of its products with a rotation (k, k) is the correlation of all columns, with the gyro rotated.
+    """
+    seen = seen - seen.mean(axis=0)
+    squares = np.einsum("dki,dki->d", gyro, gyro) - len(seen) * (gyro.mean(axis=1) ** 2).sum(axis=1)
+    sizes = np.sqrt(np.maximum(squares, 0.0) * (seen * seen).sum())
+    return np.asarray(seen.T @ gyro / np.maximum(sizes, 1e-12)[:, None, None])
 
 
 def _inliers(seen: Array, turned: Array) -> Array:
@@ -148,10 +156,11 @@ def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tup
     return None
 
 
-def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shift_s: float) -> Array:
-    """Return (K, 3) mean gyro rates over the intervals, shifted by `shift_s` on the IMU's clock."""
+def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shifts_s: AnyArray | float) -> Array:
+    """Return (..., K, 3) mean gyro rates over the intervals, shifted by each of `shifts_s` on the IMU's clock."""
     origin_ns = int(imu.stamps_ns[0])
-    between_s = (np.column_stack([turns.starts_ns, turns.ends_ns]) - origin_ns) * 1e-9 + shift_s
+    between_s = (np.column_stack([turns.starts_ns, turns.ends_ns]) - origin_ns) * 1e-9
+    between_s = between_s + np.asarray(shifts_s)[..., None, None]
     turned = turned_between((imu.stamps_ns - origin_ns) * 1e-9, imu.gyro_radps, between_s)
     return np.asarray(turned / np.diff(between_s))
 
@@ -162,9 +171,9 @@ def correlation(first: Array, second: Array) -> float:
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))
 
 
-def _axes(seen: Array, gyro: Array) -> tuple[Array, int]:
+def _axes(correlated: Array) -> tuple[Array, int]:
     """Return orthogonal body_from_gyro (3, 3) and the number of axes of common rotation. With an unobserved axis it is a rotation."""
-    u, singular, vt = np.linalg.svd(seen.T @ (gyro - gyro.mean(axis=0)))
+    u, singular, vt = np.linalg.svd(correlated)
     axes_seen = int((singular > 0.03 * singular[0]).sum())
     if axes_seen < 2:  # the smallest rotation that aligns the two axes, or its reverse
         return rotation_between_vectors(vt[0], u[:, 0]), axes_seen

@@ -27,6 +27,7 @@ from mapserver.survey.survey_inputs import SurveyTools, TrackedFrame
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 20
+_MATCHED_EVERY = 4  # of those, while the matches of the pairs are good beyond doubt
 _STEP_S = 0.045  # between two frames for a speed: one step at 20 Hz
 TURN_FRAMES = 120
 _EARLY = TURN_FRAMES // 2, TURN_FRAMES  # frames after which a drive is doubted at once, not at its end
@@ -48,7 +49,7 @@ class CheckResults:
     metres: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-_Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None]
+_Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None, bool]
 
 
 class _Frames:
@@ -75,17 +76,18 @@ class _Frames:
         frame = self.read(index)
         return None if frame is None else self.rectifier.rectify(frame)
 
-    def moments(self, count: int) -> Iterator[_Moment]:
-        """Yield frames spread over the recording, raw and rectified, and the next ones if they are near and a speed is needed."""
+    def moments(self, matched_every: int) -> Iterator[_Moment]:
+        """Yield frames over the recording, raw and rectified, the next ones if near and a speed is needed, and if their pair is matched."""
         stamps_ns = self.recording.frame_stamps_ns
         needs_speed = bool(self.recording.wheel) or not len(self.recording.imu)
-        for index in np.unique(np.linspace(0, len(stamps_ns) - 1, min(count, len(stamps_ns))).round().astype(int)):
+        spread = np.linspace(0, len(stamps_ns) - 1, min(SAMPLED_FRAMES, len(stamps_ns))).round().astype(int)
+        for number, index in enumerate(np.unique(spread)):
             frame = self.read(int(index))
             after = int(np.searchsorted(stamps_ns, stamps_ns[index] + int(_STEP_S * 1e9)))
             is_near = after < len(stamps_ns) and stamps_ns[after] - stamps_ns[index] < sensors.SPARSE_S * 1e9
             later = self._rectified(after) if needs_speed and is_near else None
             if frame is not None:
-                yield frame, self.rectifier.rectify(frame), later
+                yield frame, self.rectifier.rectify(frame), later, number % matched_every == 0
 
     def consecutive(self, count: int) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
         """Yield pairs of rectified frames close in time, from the run of frames with the fastest rotation by the gyro."""
@@ -157,7 +159,8 @@ def run_checks(
     turns, gyro, gyro_fit, axes, given = by_turns
     upside_down = turn_upside_down(turns, imu, shift_s, frames.rectifier.body_from_cam)
     if has_pair:
-        soon = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in soon]
+        ordered, _ = _of_pairs(frames, seen.looks, upside_down)
+        soon = [ordered if f.name == SWAPPED else f for f in soon]
     if upside_down:
         words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
         gyro = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in gyro]
@@ -271,10 +274,6 @@ class _Seen(NamedTuple):
     images: ImageMetres | None
     wheels: WheelFit | None
 
-    @property
-    def pairs(self) -> list[StereoMatches]:
-        return [look.pair for look in self.looks if look.pair is not None]
-
 
 def _soon_seen(frames: _Frames, seen: _Seen) -> list[Finding]:
     recording, imu, camera = frames.recording, frames.recording.imu, frames.recording.calibration.cameras[0]
@@ -287,15 +286,22 @@ def _soon_seen(frames: _Frames, seen: _Seen) -> list[Finding]:
         images.fixed_pattern([look.structure for look in seen.looks]),
     ]
     if recording.sensor_set in _PAIRS:
-        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, frames.rectifier.camera.focal_px)]
+        findings += _of_pairs(frames, seen.looks)
     if recording.sensor_set is SensorSet.RGBD:
         shares = [look.depth_share for look in seen.looks if look.depth_share is not None]
         findings.append(images.measured_depth(shares))
     return [*findings, images.lens_check(recording, frames.read)]
 
 
+def _of_pairs(frames: _Frames, looks: Sequence["_Look"], upside_down: bool | None = None) -> list[Finding]:
+    pairs = [look.pair for look in looks if look.pair is not None]
+    return [swapped_cameras(pairs, upside_down=upside_down), epipolar_error(pairs, frames.rectifier.camera.focal_px)]
+
+
 def _sampled(frames: _Frames, executor: Executor) -> _Seen:
-    looks, recording = list(executor.map(_look, frames.rig, frames.moments(SAMPLED_FRAMES))), frames.recording
+    recording, looks = frames.recording, list(executor.map(_look, frames.rig, frames.moments(_MATCHED_EVERY)))
+    if recording.sensor_set in _PAIRS and worst(_of_pairs(frames, looks)) is not Verdict.OK:
+        looks = list(executor.map(_look, frames.rig, frames.moments(1)))
     depths = [look.depth_m for look in looks if np.isfinite(look.depth_m)]
     turns = CameraTurns.of(look.motion for look in looks if look.motion is not None)
     metres, wheels, calibration = None, None, recording.calibration
@@ -323,8 +329,8 @@ class _Look(NamedTuple):
 
 
 def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
-    (camera, _), (frame, rectified, after) = rig, moment
-    pair = None if frame.right is None else match_stereo(rectified)
+    (camera, _), (frame, rectified, after, is_matched) = rig, moment
+    pair = match_stereo(rectified) if is_matched and frame.right is not None else None
     share, depth_m = None, np.nan
     if frame.depth_m is not None:
         share, known = images.depth_share(frame.depth_m), frame.depth_m[frame.depth_m > 0]

@@ -97,8 +97,8 @@ def _stacked(matrices: Sequence[Array], size: int) -> Array:
 
 def packed_increments(summed: Sequence[Preintegrated]) -> Array:
     """Return (E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases of linearisation."""
-    rows = [np.concatenate([np.ravel(getattr(each, name)) for name in _INCREMENTS]) for each in summed]
-    return np.array(rows).reshape(-1, 67)
+    fields = (np.array([getattr(each, name) for each in summed]) for name in _INCREMENTS)
+    return np.hstack([field.reshape(len(summed), -1) for field in fields]) if summed else np.zeros((0, 67))
 
 
 def _informations(covariances: Array) -> Array:

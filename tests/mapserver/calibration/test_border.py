@@ -104,7 +104,7 @@ def test_squares_and_redundancies_are_those_of_the_hat_matrix(scene: Scene) -> N
     kind[images : images + 15 * edges] = np.tile(np.repeat([3, 4, -1], [3, 6, 6]), edges)
     kind[images + 15 * edges :][: 3 * len(scene.problem.wheels)] = np.tile([5, -1, -1], len(scene.problem.wheels))
     used = np.abs(whole).sum(axis=1) > 0
-    squares, redundancy = scene.problem.variance_components(scene.theta, scene.state)
+    squares, redundancy = scene.problem.variance_components(scene.theta, scene.state, np.zeros(6), range(6))
     left = (scene.weights * scene.residuals) ** 2
     np.testing.assert_allclose(squares, [left[kind == n].sum() for n in range(6)], rtol=1e-9)
     # what keeps landmarks invertible holds the gauge too, by less than one residual
