@@ -14,7 +14,7 @@ import numpy as np
 from fleetmap.core import BundleSolver
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import ImuNoise
-from mapserver.calibration.image_rows import Fixed, Measured, Observations, image_rows
+from mapserver.calibration.image_rows import Measured, Observations, image_rows
 from mapserver.calibration.motion_rows import CalibrationData, MotionState, body_rates, inertial_edges, wheel_edges
 from mapserver.calibration.parameters import COLUMNS, INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.survey.bundle.bundle_adjustment import solver_of
@@ -23,6 +23,7 @@ from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings
 from mapserver.survey.state import PriorTerm
 
+Rows = Callable[..., ImageRows]
 SETTINGS = BundleSettings(max_iterations=12, huber_sigmas=3.0, cutoff_sigmas=8.0, lambda_start=1e-6)
 _ROUNDS = 5  # each re-estimates the noise scales and integrates the samples at the new biases
 _TOLERANCE = 1e-5
@@ -147,14 +148,12 @@ class Problem:
             map_from_body[:, :3, 3] += late_s * motions[:, :3]
             map_from_body[:, :3, :3] = turns @ map_from_body[:, :3, :3]
         state = MotionState(map_from_body, motions if self.data.is_inertial else self.data.start.motions, points)
-        fixed = Fixed(self.rates_map, self.slopes) if derivatives and self.slopes is not None else None
+        slopes = (self.rates_map, self.slopes) if derivatives else ()
         if not np.array_equal(theta, self.measured[0]):
             self.measured = theta, self.seen.measured(theta)
-        return image_rows(self.seen, self.data, state, *self.measured, self.scales.images, fixed)
+        return image_rows(self.seen, self.data, state, *self.measured, self.scales.images, *slopes)
 
-    def bundle(
-        self, theta: Array, state: MotionState, shares: Array, rows: Callable[..., ImageRows] | None = None
-    ) -> BundleProblem:
+    def bundle(self, theta: Array, state: MotionState, shares: Array, rows: Rows | None = None) -> BundleProblem:
         """Return the adjustment at theta and `state`, by default with its own rows; each kind of motion is weighted by shares (3,)."""
         rotation, motion, way = shares.tolist()
         inertial, data = None, self.data
@@ -199,7 +198,7 @@ class Problem:
 
     def first_scales(self) -> ErrorScales:
         """Return scales wide enough for the median observation: with a wrong calibration all residuals are large at first."""
-        rows = image_rows(self.seen, self.data, self.data.start, *self.measured, np.ones(4), None).residuals
+        rows = image_rows(self.seen, self.data, self.data.start, *self.measured, np.ones(4)).residuals
         norm = np.linalg.norm(rows[np.isfinite(self.seen.row_sigmas[:, 0])], axis=1)
         return ErrorScales(np.full(4, max(1.0, float(np.median(norm)) / _MEDIAN_NORM) if len(norm) else 1.0))
 
@@ -225,7 +224,7 @@ class Problem:
         kinds = felt[:, :3], felt[:, 3:9], rolled
         squares = np.array([sums[0] + sums[1], *sums[2:], *((kind**2).sum() for kind in kinds)])
         numbers = np.array([counted[:2].sum(), counted[2].sum(), counted[3].sum(), *(kind.size for kind in kinds)])
-        redundancy, asked, weighted = known.copy(), [kind for kind in asked if numbers[kind]], rows
+        redundancy, weighted = known.copy(), rows
 
         def solver(motions: Array) -> BundleSolver:
             return solver_of(self.bundle(theta, state, motions, lambda *_: weighted), SETTINGS)
@@ -234,7 +233,7 @@ class Problem:
             return squares, redundancy
         as_is = solver(np.ones(3))
         alone = as_is.log_determinant()
-        for kind in asked:
+        for kind in (kind for kind in asked if numbers[kind]):
             shares = 1.0 + _SHARE * (np.arange(6) == kind)
             weighted = rows._replace(shares=shares[[0, 0, 1, 2]])
             grown = (as_is if kind < 3 else solver(shares[3:])).log_determinant()

@@ -30,21 +30,21 @@ from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
 _STEP_PX = 0.1  # of the numerical derivative of raw by rectified pixels
-# Columns that move what the left lens measures
+# Columns of the distortion of both lenses, and of their difference; those that move what the left lens measures
+_BOTH = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
+_DIFFERENCE = slice(_BOTH.stop, _BOTH.stop + DISTORTION)
 _LEFT_LENS = {
     INDEX[P.FOCAL],
     INDEX[P.PRINCIPAL_X],
     INDEX[P.PRINCIPAL_Y],
-    *range(len(COLUMNS), len(COLUMNS) + DISTORTION),
+    *range(_BOTH.start, _BOTH.stop),
 }
 # Step sizes of the numerical derivatives of the measurements: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PAIR_ROLL]), 1e-5)
-_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + DISTORTION), 1e-5)
-_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.01)
-_BOTH = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
-_DIFFERENCE = slice(_BOTH.stop, _BOTH.stop + DISTORTION)
+_LENS_STEPS |= dict.fromkeys(range(_BOTH.start, _BOTH.stop), 1e-5)
+_LENS_STEPS |= dict.fromkeys(range(_DIFFERENCE.stop, UNKNOWNS), 0.01)
 _PLACE = [INDEX[p] for p in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z)]
 _TURN = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
 _SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
@@ -62,13 +62,6 @@ class Measured(NamedTuple):
 
     rows: Array
     as_given: Array
-
-
-class Fixed(NamedTuple):
-    """Nearly constant values near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes`."""
-
-    rates_map: Array
-    slopes: Measured
 
 
 @dataclass(frozen=True)
@@ -126,9 +119,9 @@ class Observations:
         self, rectified: Array, theta: Array, pair: tuple[StereoCamera, StereoCamera], number: int = 0
     ) -> Array:
         """Return (M, 2, 2) derivatives of raw by rectified pixels."""
-        steps = _STEP_PX * np.eye(2)
-        ends = [[self._raw(number, rectified + sign * step, theta, pair) for sign in (1, -1)] for step in steps]
-        return np.stack([(more - less) / (2.0 * _STEP_PX) for more, less in ends], axis=2)
+        steps = _STEP_PX * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])[:, None]
+        ends = self._raw(number, (rectified + steps).reshape(-1, 2), theta, pair).reshape(4, -1, 2)
+        return np.asarray((ends[::2] - ends[1::2]).transpose(1, 2, 0) / (2.0 * _STEP_PX))
 
     def _as_given(self, raw_by_now: Array) -> Array:
         """Return that of `Measured`; the identity where it is unknown."""
@@ -161,12 +154,9 @@ class Observations:
         slopes = Measured(np.zeros((len(raw[0]), 4, UNKNOWNS)), np.zeros((len(raw[0]), 2, 2, UNKNOWNS)))
         for column, size in _LENS_STEPS.items():
             end = theta + size * (np.arange(UNKNOWNS) == column)
-            changes = [
-                before - self._raw(n, place, end, pair)
-                for n, (place, before) in enumerate(zip(places, raw, strict=True))
-            ]
             moves = [
-                _product(turn, each[:, :, None])[..., 0] / size for turn, each in zip(by_raw, changes, strict=True)
+                _product(turn, (before - self._raw(n, place, end, pair))[:, :, None])[..., 0] / size
+                for n, (place, before, turn) in enumerate(zip(places, raw, by_raw, strict=True))
             ]
             slopes.rows[..., column] = np.column_stack([moves[0], moves[0] - moves[-1]])
             if column in _LEFT_LENS:
@@ -208,24 +198,23 @@ def image_rows(
     theta: Array,
     measured: Measured,
     scales: Array,
-    fixed: Fixed | None,
+    rates_map: Array | None = None,
+    by_lens: Measured | None = None,
 ) -> ImageRows:
-    """Return whitened rows at a state, a theta and its `measured`, zero without an observation; with `fixed` also derivatives.
+    """Return whitened rows at a state, a theta and its `measured`, zero without an observation; with the slopes by_lens also derivatives.
 
-    A landmark behind the camera gets the largest residual.
-
-    scales (4,): factors on the rows' sigmas.
+    A landmark behind the camera gets the largest residual. scales (4,): factors on the rows' sigmas; rates_map (K, 3): of the body.
     """
     left, right = seen.pair(theta)
     turned = seen.axes.body_from_rect @ so3_exp(theta[_TURN])
     place = seen.calibration.cameras[0].body_from_cam[:3, 3] + theta[_SHIFT]
     right_m = right_camera(seen.axes, theta)[1] if seen.axes.baseline_m > 0 else np.zeros(3)
     slopes = None
-    if fixed is not None:
+    if by_lens is not None and rates_map is not None:
         steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
         moved = [right_camera(seen.axes, theta + step)[1] - right_camera(seen.axes, theta - step)[1] for step in steps]
         zoom = float(1.0 + theta[INDEX[P.FOCAL_RATIO]])
-        slopes = *fixed.slopes, fixed.rates_map, state.motions, np.stack(moved, axis=1) / 2e-6, _COLUMNS, zoom
+        slopes = *by_lens, rates_map, state.motions, np.stack(moved, axis=1) / 2e-6, _COLUMNS, zoom
     residuals, by_point, by_calibration = core.image_rows(
         np.array([left.focal_px, right.focal_px, left.cx_px, left.cy_px]),
         se3_inverse(se3(turned, place)),

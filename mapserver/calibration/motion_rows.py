@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -64,21 +65,24 @@ _RATE_NS = 5_000_000  # half the time over which the angular rate at a keyframe 
 
 
 class InertialEdge(NamedTuple):
-    """Samples between keyframes first and first + 1; root (15, 15): lower triangular factor of their covariance."""
+    """Samples between keyframes first and first + 1, as the core takes them; root (15, 15): lower triangle of their covariance."""
 
     first: int
     summed: Preintegrated
+    increments: Array
     root: Array
 
     def residual(self, state: MotionState) -> Array:
         """Return (15,) whitened: rotation, motion, and change of the biases."""
         ends = slice(self.first, self.first + 2)
-        increments = packed_increments([self.summed])[0]
-        residual, _ = core.inertial_residual(state.map_from_body[ends], state.motions[ends], GRAVITY_MAP, increments)
+        moments = state.map_from_body[ends], state.motions[ends]
+        residual, _ = core.inertial_residual(*moments, GRAVITY_MAP, self.increments)
         return np.asarray(np.linalg.solve(self.root, residual))
 
     def believed(self, rotation: float, motion: float) -> Preintegrated:
         """Return the samples with information of rotation and motion scaled by these factors."""
+        if rotation == motion == 1.0:
+            return self.summed
         root = self.root / np.sqrt(np.repeat([rotation, motion, 1.0], [3, 6, 6]))
         return replace(self.summed, cov=root @ root.T - np.diag(FLOOR_SIGMA**2))
 
@@ -111,14 +115,11 @@ def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, n
     """Return preintegrated samples between keyframes at the state's biases; offset_s: correction of the calibration's time offset."""
     if not data.is_inertial:
         return []
-    stamps = imu_stamps(data, offset_s)
-    edges = []
-    for k in range(len(stamps) - 1):
-        summed = preintegrate(
-            data.imu, int(stamps[k]), int(stamps[k + 1]), state.motions[k, 3:6], state.motions[k, 6:], noise
-        )
-        edges.append(InertialEdge(k, summed, np.asarray(np.linalg.cholesky(summed.cov + np.diag(FLOOR_SIGMA**2)))))
-    return edges
+    stamps, biases = imu_stamps(data, offset_s).tolist(), state.motions[:, 3:].reshape(-1, 2, 3)
+    spans = zip(pairwise(stamps), biases, strict=False)
+    summed = [preintegrate(data.imu, *ends, bias[0], bias[1], noise) for ends, bias in spans]
+    roots = np.linalg.cholesky(np.array([each.cov for each in summed]).reshape(-1, 15, 15) + np.diag(FLOOR_SIGMA**2))
+    return list(map(InertialEdge, count(), summed, packed_increments(summed), roots))
 
 
 def imu_stamps(data: CalibrationData, offset_s: float) -> Array:
@@ -152,7 +153,8 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
         if len(samples) < 2 or (samples[-1].stamp_ns - samples[0].stamp_ns) * 1e-9 < 0.7 * dt_s:
             continue
         turn = so3_log(state.map_from_body[k, :3, :3].T @ state.map_from_body[k + 1, :3, :3])
-        at, share = _shares([sample.stamp_ns for sample in samples], int(stamps[k]), int(stamps[k + 1])).T
+        at = np.array([sample.stamp_ns - stamps[k] for sample in samples]) / (stamps[k + 1] - stamps[k])
+        share = np.diff([0.0, *0.5 * (at[1:] + at[:-1]), 1.0])
         ways = np.array([sample.velocity_base_mps for sample in samples]) @ base_from_body[:3, :3]
         way = dt_s * share @ (so3_exps(at[:, None] * turn) @ ways[:, :, None])[..., 0]
         sigma_m = float(np.linalg.norm(dt_s * share * [sample.sigma_mps for sample in samples]))
@@ -161,10 +163,3 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
         turned = base_from_body[:3, :3] @ so3_exp(-0.5 * turn)
         edges.append(WheelEdge(k, way, base_in_body - so3_exp(turn) @ base_in_body, turned / sigma[:, None]))
     return edges
-
-
-def _shares(sample_ns: list[int], start_ns: int, end_ns: int) -> Array:
-    """Return (n, 2) for each sample: its position between start and end, and its share of the time."""
-    at = (np.array(sample_ns, np.int64) - start_ns) / (end_ns - start_ns)
-    bounds = np.concatenate([[0.0], 0.5 * (at[1:] + at[:-1]), [1.0]])
-    return np.column_stack([at, np.diff(bounds)])

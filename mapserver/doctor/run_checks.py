@@ -8,6 +8,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
+from fleetmap.odometry.accelerometer_check import LONGEST_STEP_NS
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -18,7 +19,7 @@ from mapserver.doctor.accelerometer_images import AxesFit, accelerometer_axes, f
 from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
 from mapserver.doctor.camera_motion import CameraTurns, OdometryTurns, body_motion
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged, worst
-from mapserver.doctor.gyro_images import AXES, GyroFit, gyro_check, turn_upside_down
+from mapserver.doctor.gyro_images import AXES, OFFSET, GyroFit, gyro_check, turn_upside_down
 from mapserver.doctor.metres import ImageMetres, WheelFit, fit_wheels, judge_metres
 from mapserver.doctor.stereo import ROTATE_BACK, SWAPPED, StereoMatches, epipolar_error, match_stereo, swapped_cameras
 from mapserver.survey.executor import SERIAL, Executor
@@ -28,6 +29,7 @@ from mapserver.survey.survey_inputs import SurveyTools, TrackedFrame
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 20
 _MATCHED_EVERY = 4  # of those, while the matches of the pairs are good beyond doubt
+_LONGEST_STEP_S = 0.7e-9 * LONGEST_STEP_NS  # of an IMU whose steps vary
 _STEP_S = 0.045  # between two frames for a speed: one step at 20 Hz
 TURN_FRAMES = 120
 _EARLY = TURN_FRAMES // 2, TURN_FRAMES  # frames after which a drive is doubted at once, not at its end
@@ -53,15 +55,25 @@ _Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None, bool]
 
 
 class _Frames:
-    """Reads the frames of a recording and records the unreadable ones."""
+    """Reads the frames of a recording and records the unreadable ones, also as the source of its `recording`'s frames."""
 
     def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
-        self.recording, self._on_frame = recording, on_frame
+        self.source, self._on_frame = recording.frames, on_frame
+        self.stored, self.part, self.hash_into = self.source.stored, self.source.part, self.source.hash_into
+        self.close, self.recording = self.source.close, replace(recording, frames=self)
+        self.errors: dict[int, str] = {}
         self.rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
         self.rig = self.rectifier.camera, self.rectifier.body_from_cam
         self.tried: set[int] = set()
-        self.errors: dict[int, str] = {}
         self.repeats = 0
+
+    def frame(self, index: int) -> CameraFrame:
+        """See FrameSource."""
+        try:
+            return self.source.frame(index)
+        except RecordingError as error:
+            self.errors[index] = str(error)
+            raise
 
     def read(self, index: int) -> CameraFrame | None:
         self.tried.add(index)
@@ -140,10 +152,9 @@ def run_checks(
     not certify the IMU, also a run of TURN_FRAMES. `on_frame` is called after each. before_calibration: called with the findings before the
     calibration is measured.
     """
-    imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
-    shift_s = recording.calibration.cameras[0].imu_minus_cam_s
     frames = _Frames(recording, on_frame)
-    seen = _sampled(frames, executor)
+    recording, seen = frames.recording, _sampled(frames, executor)
+    imu, has_pair, camera = recording.imu, recording.sensor_set in _PAIRS, recording.calibration.cameras[0]
     soon = _soon_seen(frames, seen)
 
     stamps = [*sensors.camera_checks(recording.frame_stamps_ns), *sensors.imu_checks(imu.stamps_ns)]
@@ -157,10 +168,9 @@ def run_checks(
         pairs = frames.consecutive(TURN_FRAMES)
         by_turns = _by_turns(recording, CameraTurns.of(executor.map(body_motion, frames.rig, pairs)), soon)
     turns, gyro, gyro_fit, axes, given = by_turns
-    upside_down = turn_upside_down(turns, imu, shift_s, frames.rectifier.body_from_cam)
+    upside_down = turn_upside_down(turns, imu, camera.imu_minus_cam_s, frames.rectifier.body_from_cam)
     if has_pair:
-        ordered, _ = _of_pairs(frames, seen.looks, upside_down)
-        soon = [ordered if f.name == SWAPPED else f for f in soon]
+        soon = [_of_pairs(frames, seen.looks, upside_down)[0] if f.name == SWAPPED else f for f in soon]
     if upside_down:
         words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
         gyro = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in gyro]
@@ -206,6 +216,12 @@ class _ByTurns(NamedTuple):
     given: AxesFit | None
 
     @property
+    def is_unsteady(self) -> bool:
+        """True if the two clocks drift against each other, and all else is good."""
+        others = worst([*(f for f in self.gyro if f.name != OFFSET), self.axes])
+        return self.gyro_fit is not None and self.gyro_fit.is_unsteady and others is Verdict.OK
+
+    @property
     def verdict(self) -> Verdict:
         """The worst of them; a doubtful offset is no good one."""
         is_late = self.gyro_fit is not None and abs(self.gyro_fit.offset_s) > _CERTAIN_OFFSET_S
@@ -243,6 +259,8 @@ def _by_odometry(
     turns = CameraTurns.of(seen.motions)
     is_whole = not seen.repeats and len(turns.starts_ns) > _CERTAIN_SHARE * len(seen.motions)
     found = _by_turns(recording, turns, soon) if is_whole else None
+    if found is not None and found.is_unsteady:  # what TURN_FRAMES are too few to show, and what refuses no recording
+        return found, data
     if found is None or found.verdict is not Verdict.OK:
         return None, data
     # The fit of a metre is biased by noise of the images, and over a whole drive surer than that: it certifies, but refuses nothing.
@@ -257,6 +275,10 @@ def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Find
     has_gravity = not any(f.name == sensors.GRAVITY and f.verdict is Verdict.FAIL for f in soon)
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
     fits = fit_accelerometer(turns, recording.imu, shift_s) if has_gravity else []
+    period_s = sensors.median_period_s(recording.imu.stamps_ns)
+    if has_gravity and not fits and period_s > _LONGEST_STEP_S:
+        seldom = f"{1 / period_s:.0f} samples a second do not show how the velocity changes"
+        return not_judged(accelerometer_images.NAME, seldom, sensors.FASTER_IMU), None
     axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
     return axes, next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
 
@@ -345,7 +367,7 @@ def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
 
 
 def _readable(frames: _Frames) -> Finding:
-    tried, errors = len(frames.tried), list(frames.errors.values())
+    tried, errors = len(frames.tried | frames.errors.keys()), list(frames.errors.values())
     bad = f"{len(errors)} of {tried} cannot be read; {''.join(errors[:1])}"
     limits = Limits(0, 0, words="every checked frame must be readable")
     return judge("images", float(len(errors)), limits, f"all {tried} checked frames are readable", bad)

@@ -12,6 +12,7 @@ from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judge
 GRAVITY = "gravity magnitude"
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 NO_IMU = ("there is no IMU", "record an IMU")
+FASTER_IMU = "set the IMU to 200 Hz, slow ones miss vibration and turns"
 _SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
 _DISORDER = "stamps not increasing"
 # Ends of issues about recordings with complete data
@@ -57,7 +58,7 @@ def imu_checks(stamps_ns: Stamps) -> tuple[Finding, Finding]:
         return not_judged("imu rate", *NO_IMU), not_judged("imu gaps", *NO_IMU)
     period_s = median_period_s(stamps_ns)
     return (
-        _rate("imu rate", 1 / period_s, _SLOWEST_IMU_HZ, "set the IMU to 200 Hz, slow ones miss vibration and turns"),
+        _rate("imu rate", 1 / period_s, _SLOWEST_IMU_HZ, FASTER_IMU),
         _gaps("imu gaps", stamps_ns, max(3.5 * period_s, 0.02), 0.2, "inertial samples"),
     )
 

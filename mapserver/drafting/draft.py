@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,8 @@ def build_draft(
     a job of the store.
     """
     options, times = request.options, StageTimes(time.perf_counter)
+    if find_spec("gtsam") is None:  # or a build would end at its first loop
+        raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
         raise UsageError(f"{given.file} is for one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)

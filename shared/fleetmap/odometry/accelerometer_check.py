@@ -16,7 +16,7 @@ from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
 
 _HALF_NS, _LONGEST_NS = 200_000_000, 350_000_000  # half a window, and the longest between two frames
-_GAP_NS = 50_000_000  # between two samples, at most
+LONGEST_STEP_NS = 50_000_000  # between two samples, at most
 _CHANGE_SIGMA_MPS, _BIAS_SIGMA_MPS2 = 0.05, 0.3
 _KEPT = 0.97  # of earlier evidence, with each window: turns accumulate errors of the images
 _MIN_WINDOWS, _SIZE_WINDOWS, _MANY_WINDOWS = 4, 10, 20
@@ -44,7 +44,7 @@ def change_of_velocity(run: Sequence[Posed], middle: int, imu: ImuSamples) -> Ar
     """
     start_ns, end_ns = run[0][0], run[-1][0]
     samples = imu.between(start_ns, end_ns)
-    if len(samples) < 8 or core.longest_gap_ns(samples.stamps_ns, start_ns, end_ns) > _GAP_NS:
+    if len(samples) < 8 or core.longest_gap_ns(samples.stamps_ns, start_ns, end_ns) > LONGEST_STEP_NS:
         return None
     frames_ns, places, rotations, turns = (np.array(each) for each in zip(*run, strict=True))
     of_frames = frames_ns, rotations, turns, places, middle

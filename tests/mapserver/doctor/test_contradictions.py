@@ -232,15 +232,23 @@ def test_one_camera_turns_and_shows_no_metres(ride: Recording) -> None:
 
 
 @pytest.mark.usefixtures("_quick")
+def test_an_imu_too_slow_for_velocities_is_what_is_lacking(ride: Recording) -> None:
+    slow = ImuSamples(
+        *(samples[::12].copy() for samples in (ride.imu.stamps_ns, ride.imu.gyro_radps, ride.imu.accel_mps2))
+    )
+    (axes,) = (f for f in run_checks.run_checks(replace(ride, imu=slow)).findings if f.name == "accelerometer axes")
+    assert (axes.verdict, "17 samples a second" in axes.sentence) == (Verdict.NOT_JUDGED, True)
+
+
+@pytest.mark.usefixtures("_quick")
 def test_images_that_repeat_are_told_from_rest(ride: Recording) -> None:
     """The ride begins with a second at rest, in the same image; every third image that is the one before is a fault."""
 
-    class Repeating:
-        def frame(self, index: int) -> CameraFrame:
-            shown = ride.read_frame(index - (index % 3 == 2))
-            return replace(shown, stamp_ns=int(ride.frame_stamps_ns[index]))
+    def repeating(frame: CameraFrame) -> CameraFrame:
+        index = int(np.searchsorted(ride.frame_stamps_ns, frame.stamp_ns))
+        return replace(ride.read_frame(index - (index % 3 == 2)), stamp_ns=frame.stamp_ns)
 
-    findings = run_checks.run_checks(replace(ride, frames=Repeating())).findings  # type: ignore[arg-type]
+    findings = run_checks.run_checks(changed(ride, repeating)).findings
     failed = {f.name for f in findings if f.verdict is Verdict.FAIL}
     assert "repeated images" in failed
     assert "wheels" not in failed

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.errors import CalibrationError
+from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, format_calibration, open_recording, read_calibration
 from fleetmap.recordings.sensor_subset import reduced
@@ -20,7 +20,7 @@ from mapserver.doctor.findings import grouped, not_judged, summary
 from mapserver.doctor.gyro_images import fit_gyro, gyro_check
 from mapserver.doctor.images import flicker_check, sharpness
 from mapserver.doctor.metres import ImageMetres, judge_metres
-from mapserver.doctor.run_checks import TURN_FRAMES, _Frames
+from mapserver.doctor.run_checks import TURN_FRAMES, _ByTurns, _Frames
 from mapserver.doctor.sensors import (
     camera_checks,
     camera_imu_overlap,
@@ -174,6 +174,10 @@ def test_unreadable_frames_are_a_finding(tmp_path: Path) -> None:
     assert finding.verdict is Verdict.FAIL
     assert finding.sentence.startswith("1 of 3 cannot be read")  # however often it was looked at
     assert "image1.jpg" in finding.sentence
+    frames = _Frames(open_recording(folder), lambda: None)
+    with pytest.raises(RecordingError):
+        frames.recording.read_frame(1)
+    assert frames.errors.keys() == {1}, "what only the odometry reads is noted, too"
 
 
 def stamps(step_s: float, count: int = 200) -> Stamps:
@@ -273,6 +277,7 @@ def test_stamps_that_move_within_the_run_are_no_time_offset() -> None:
     assert "stamp both by one clock" in offset.sentence
     assert "timeshift_cam_imu" not in offset.sentence
     assert {finding.verdict for finding in findings[1:]} == {Verdict.OK}
+    assert _ByTurns(moved, findings, fit, findings[1], None).is_unsteady
 
 
 def test_the_command_writes_json_and_ends_with_3_on_failure(run, tmp_path: Path) -> None:

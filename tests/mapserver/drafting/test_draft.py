@@ -171,7 +171,7 @@ def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:
     assert "no ground truth" in str(error)
 
 
-def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path) -> None:
+def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     to_store = ["--site", "lab", "--store", tmp_path / "store"]
     for arguments, kind, said in (
         ([drive, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),
@@ -186,6 +186,8 @@ def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path) -
         error = refused(*arguments)
         assert isinstance(error, kind)
         assert said in str(error)
+    monkeypatch.setattr("mapserver.drafting.draft.find_spec", lambda _: None)
+    assert "gtsam" in str(invoke(app, "build", drive, *to_store).exception)
     assert not (tmp_path / "store").exists()
 
 
