@@ -1,7 +1,9 @@
 """The library: maps built from recordings, and maps of a store as arrays. Paths are str or Path, errors FleetmapErrors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from fleetmap.mapformat.names import check_name
 from fleetmap.mapformat.tile import Tile, decode_tile
+from fleetmap.recordings import open_recording
 from fleetmap.recordings.sensor_subset import sensor_set_of
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
@@ -89,16 +92,25 @@ def build_map(
     options = options or BuildOptions()
     paths = (recordings,) if isinstance(recordings, str | Path) else recordings
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
-    draft, built = build_draft(request, settings_for(request), recorded=True)
+    is_chosen = options.settings is not None or options.use is not None
+    with nullcontext() if is_chosen else open_recording(request.recordings[0], options.opening) as first:
+        request = replace(request, first=first)
+        draft, built = build_draft(request, settings_for(request), recorded=True)
     return BuiltMap(draft.version, draft.sentence, draft.report, draft.left_out, request.store, site, built)
 
 
 def settings_for(request: BuildRequest) -> SurveySettings:
-    """Return the survey settings of the request: its own, or the preset of the first recording's sensors, overridden by its file."""
-    options = request.options
+    """Return the survey settings of the request: its own, or the preset of the first recording's sensors, overridden by its file.
+
+    ModuleNotFoundError without gtsam, before a build that would end at its first loop.
+    """
+    if find_spec("gtsam") is None:
+        raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
+    options, first = request.options, request.first
     if options.settings is not None:
         return options.settings
-    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.opening))
+    known = options.use if first is None else first.sensor_set
+    return survey_settings(options.config, known or sensor_set_of(request.recordings[0], options.opening))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.hooks import plugins
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
-from fleetmap.recordings import Topics
+from fleetmap.recordings import Recording, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
@@ -102,12 +101,13 @@ class BuildOptions(RecordingOptions):
 
 @dataclass(frozen=True, slots=True)
 class BuildRequest:
-    """Recordings for a draft of a site in a store."""
+    """Recordings for a draft of a site in a store. first: the first of them, if it is open already."""
 
     recordings: tuple[Path, ...]
     site: str
     store: Path
     options: BuildOptions = BuildOptions()
+    first: Recording | None = None
 
 
 @dataclass(frozen=True)
@@ -156,14 +156,13 @@ def build_draft(
     a job of the store.
     """
     options, times = request.options, StageTimes(time.perf_counter)
-    if find_spec("gtsam") is None:  # or a build would end at its first loop
-        raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
         raise UsageError(f"{given.file} is for one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
     console = plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
-    with single_threaded_libraries(), OpenRecordings(options, folder) as reading, MappedImageStore(folder) as images:
+    reads = OpenRecordings(options, folder, request.first)
+    with single_threaded_libraries(), reads as reading, MappedImageStore(folder) as images:
         run = _Run(request, reading, settings, zones, unusable, console, times, images)
         times.begin("examination")
         with run.tools() as tools:

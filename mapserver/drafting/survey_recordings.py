@@ -44,6 +44,7 @@ from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Watch, Zones
 
 _log = logging.getLogger(__name__)
+_Opened = tuple[Recording, NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -153,9 +154,9 @@ class RecordingOptions:
         """How recordings are opened."""
         return OpenOptions(self.calibration, self.topics)
 
-    def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
-        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
-        recording = open_recording(path, self.opening)
+    def opened(self, path: Path, keep_in: Path | None = None, found: Recording | None = None) -> _Opened:
+        """Return the recording at `path`, to be closed, and its selected frames. keep_in: a folder for KeptFrames; found: if it is open."""
+        recording = open_recording(path, self.opening) if found is None else found
         if recording.name not in {path.name, path.stem}:  # people look for the file, whatever its recorder called it
             recording = replace(recording, name=printable(path.name))
         try:
@@ -174,13 +175,13 @@ class RecordingOptions:
 class OpenRecordings(AbstractContextManager["OpenRecordings"]):
     """Recordings opened with `options`. The last used one stays open; frames decoded at its first use are not decoded again.
 
-    folder: for their temporary file.
+    folder: for their temporary file. first: the first one, if it is open already.
     """
 
-    def __init__(self, options: RecordingOptions, folder: Path) -> None:
-        self._options, self._folder, self.trajectory = options, folder, options.trajectory
+    def __init__(self, options: RecordingOptions, folder: Path, first: Recording | None = None) -> None:
+        self._options, self._folder, self._first, self.trajectory = options, folder, first, options.trajectory
         self._path: Path | None = None
-        self._opened: tuple[Recording, NDArray[np.int64]]
+        self._opened: _Opened
 
     def __exit__(self, *_: object) -> None:
         if self._path is not None:
@@ -188,10 +189,11 @@ class OpenRecordings(AbstractContextManager["OpenRecordings"]):
             self._path = None
 
     @contextmanager
-    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+    def open(self, path: Path) -> Iterator[_Opened]:
         if path != self._path:
             self.__exit__()
-            self._opened, self._path = self._options.opened(path, self._folder), path
+            first, self._first = self._first, None
+            self._opened, self._path = self._options.opened(path, self._folder, first), path
         yield self._opened
 
 

@@ -3,7 +3,9 @@
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -139,7 +141,8 @@ def test_build_takes_its_settings_from_the_file(
         return Draft(1, "done", {}, {}), None
 
     monkeypatch.setattr("mapserver.library.build_draft", build)
-    monkeypatch.setattr("mapserver.library.sensor_set_of", lambda path, options: SensorSet.STEREO)
+    opened = nullcontext(SimpleNamespace(sensor_set=SensorSet.STEREO))
+    monkeypatch.setattr("mapserver.library.open_recording", lambda path, options: opened)
     file = tmp_path / "site.toml"
     file.write_text(
         f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'

@@ -186,7 +186,7 @@ def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path, m
         error = refused(*arguments)
         assert isinstance(error, kind)
         assert said in str(error)
-    monkeypatch.setattr("mapserver.drafting.draft.find_spec", lambda _: None)
+    monkeypatch.setattr("mapserver.library.find_spec", lambda _: None)
     assert "gtsam" in str(invoke(app, "build", drive, *to_store).exception)
     assert not (tmp_path / "store").exists()
 
