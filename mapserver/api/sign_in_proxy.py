@@ -6,7 +6,6 @@ The proxy sends their name and groups in headers. These are accepted from the pr
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
 from typing import NamedTuple
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -33,7 +32,7 @@ class SignInProxy(NamedTuple):
 
     addresses: frozenset[str]
     roles: Mapping[str, Role]
-    clock_s: Callable[[], float] = field(default=time.monotonic)
+    clock_s: Callable[[], float] = time.monotonic
 
     @classmethod
     def of(cls, addresses: Iterable[str], groups: Iterable[str]) -> "SignInProxy":

@@ -1,5 +1,6 @@
 """People whom a proxy has signed in: its headers count from its address alone, for every request."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi.testclient import TestClient
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from fleetmap.errors import UsageError
@@ -27,28 +28,15 @@ PUBLISH = "/v1/sites/lab/versions/2/publish"
 ACT = {"reason": "monday"}
 
 
-class Clock:
-    s = 1000.0
-
-    def __call__(self) -> float:
-        return self.s
-
-
 @contextmanager
 def asking(server: Server, address: str, later_s: float = 0.0) -> Iterator[TestClient]:
     """A client at an address, of a server as `serve` makes it. later_s: passes between the proxy's word and the question."""
-    clock = Clock()
-    proxy = SignInProxy(SignInProxy.of([PROXY], GROUPS).addresses, SignInProxy.of([PROXY], GROUPS).roles, clock)
-    guard = GuardSettings(operators=Operators(server.store), must_sign_in=True, proxy=proxy)
+    proxy = SignInProxy.of([PROXY], GROUPS)
+    late = proxy._replace(clock_s=lambda: time.monotonic() + later_s)
+    guard = GuardSettings(operators=Operators(server.store), must_sign_in=True, proxy=late)
     app = create_app(server.store, server.fleet, ApiSettings(guard))
-
     inner: ASGIApp = ProxyHeadersMiddleware(app, [PROXY])  # type: ignore[arg-type,assignment]
-
-    async def late(scope: Scope, receive: Receive, send: Send) -> None:
-        clock.s += later_s
-        await inner(scope, receive, send)
-
-    people = ProxiedPeople(late, proxy)
+    people = ProxiedPeople(inner, proxy)
     with TestClient(people, "http://127.0.0.1", client=(address, 50000), follow_redirects=False) as client:
         yield client
 
