@@ -9,7 +9,6 @@ reported as not measured. Exit status 1 on any miss; a command that fails is one
 import argparse
 import json
 import operator
-import os
 import shlex
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from typing import Any
 from support.recordings.realdata import DATA
 
 TESTS = Path(__file__).resolve().parent
-SOURCES = os.pathsep.join(str(TESTS.parent / folder) for folder in ("shared", "", "tests"))
 COMPARISONS = {"at_most": operator.le, "at_least": operator.ge, "equals": operator.eq}
 
 
@@ -31,8 +29,7 @@ def measured(command: str, folder: Path) -> Any:
     out = folder / "figures.json"
     out.unlink(missing_ok=True)
     words = [str(out) if word == "{out}" else word for word in shlex.split(command)]
-    environment = os.environ | {"PYTHONPATH": SOURCES}
-    done = subprocess.run([sys.executable, "-m", *words], cwd=TESTS.parent, env=environment, check=False)
+    done = subprocess.run([sys.executable, "-m", *words], cwd=TESTS.parent, check=False)
     return None if done.returncode else json.loads(out.read_text("utf-8"))
 
 

@@ -1,8 +1,7 @@
 """A site that begins with an upload: over HTTP alone a recording becomes the current version; a build ends with its server."""
 
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,18 +14,11 @@ from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving
 from support.recordings.recording_samples import write_mcap
 from support.room_site import run
+from support.waiting import eventually
 from support.worlds.box_room import out_and_back, ride_sample
 
 ADA = {"actor": "ada", "reason": "a known rig"}
 LAB = "/v1/sites/lab"
-
-
-def wait_for(found: Callable[[], Any], within_s: float = 120.0) -> Any:
-    until_s = time.monotonic() + within_s
-    while not (value := found()):
-        assert time.monotonic() < until_s
-        time.sleep(0.2)
-    return value
 
 
 def pieces(path: Path) -> Iterator[bytes]:
@@ -42,7 +34,7 @@ def built(served: Served, recording: str) -> int:
         here = httpx.get(f"{served.http}{LAB}/inbox").json()
         return {"name": recording, "reason": ""}.items() <= here["waiting"][0].items()
 
-    wait_for(is_ready)
+    assert eventually(is_ready, 120.0)
     answer = httpx.post(f"{served.http}{LAB}/build", json=ADA, timeout=90)
     assert answer.status_code == 202, answer.text
     return int(answer.json()["id"])
@@ -67,13 +59,13 @@ def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
                 f"PUT {name}?actor=ada HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n".encode()
                 + bytes(3_000_000)
             )
-            wait_for(lambda: any(path.stat().st_size for path in inbox.glob("lab/.ride.mcap.*")))
-        wait_for(lambda: not list(inbox.glob("lab/*")) + list(inbox.glob("lab/.*")))
+            assert eventually(lambda: any(path.stat().st_size for path in inbox.glob("lab/.ride.mcap.*")), 120.0)
+        assert eventually(lambda: not list(inbox.glob("lab/*")) + list(inbox.glob("lab/.*")), 120.0)
         assert httpx.put(f"{served.http}{name}", params=ADA, content=pieces(ride)).status_code == 201
 
         first = built(served, "ride.mcap")
         assert "runs already" in httpx.post(f"{served.http}{LAB}/build", json=ADA, timeout=90).json()["detail"]
-        wait_for(lambda: job(first)["state"] != "running")
+        assert eventually(lambda: job(first)["state"] != "running", 120.0)
         held = httpx.get(f"{served.http}{LAB}/inbox").json()["held"][0]
         assert "--trust-calibration" in held["reason"], "too short to judge its calibration: a person decides"
         log = httpx.get(f"{served.http}/v1/jobs/{first}/log").text
@@ -86,7 +78,7 @@ def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
         again = httpx.post(f"{served.http}{LAB}/inbox/held/{held['name']}/retry", json=ADA)
         assert again.status_code == 200
         second = built(served, held["name"])
-        assert wait_for(lambda: job(second)["state"] == "done")
+        assert eventually(lambda: job(second)["state"] == "done", 120.0)
         here = httpx.get(f"{served.http}{LAB}/inbox").json()
         assert (here["waiting"], here["held"], here["bad"], here["done"]) == ([], [], [], 1)
 

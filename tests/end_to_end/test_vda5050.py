@@ -14,34 +14,16 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
-from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import sha256_hex
-from mapserver.api.app import create_app
-from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import init_here, update_lists
+from support.fleet.dashboard_scene import serving
 from support.fleet_manager.vda5050_master import Master, mosquitto, until
 from support.worlds import robot_world
 
 START_S = 120.0  # on a machine that may be busy
 FRAMES, CARRIED_AT = 1100, 490
-
-
-@contextmanager
-def http_server(store: MapStore, fleet: Fleet) -> Iterator[str]:
-    app = create_app(store, fleet)
-    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    until(lambda: server.started)
-    try:
-        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join(10)
 
 
 @contextmanager
@@ -72,24 +54,17 @@ def robot(
 
 @pytest.mark.timeout(600)
 def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_away(tmp_path: Path) -> None:
-    with (
-        mosquitto(tmp_path) as broker,
-        MapStore.open(tmp_path / "store", create=True) as store,
-        Bus("tcp/127.0.0.1:0", is_server=True).open() as bus,
-    ):
+    with mosquitto(tmp_path) as broker, MapStore.open(tmp_path / "store", create=True) as store:
         robot_world.save(store)
         init_here(store)
-        fleet = Fleet(store)
-        service = BusService(store, fleet, bus, lambda *_: None)
         master = Master(broker)
         try:
-            with http_server(store, fleet) as http, robot(tmp_path, bus.endpoint, broker, http) as process:
-                _story(master, store, http)
+            with serving(store.folder) as served, robot(tmp_path, served.zenoh, broker, served.http) as process:
+                _story(master, store, served.http)
                 process.kill()
                 until(lambda: master.connections[-1] == "CONNECTION_BROKEN")
         finally:
             master.close()
-            service.close()
         assert master.faults == []
         assert len(master.visualizations) > 10
 

@@ -8,7 +8,6 @@ import pytest
 
 from fleetmap import failure_definition
 from fleetmap.failure_definition import (
-    SearchClock,
     is_blind,
     is_driving,
     is_found,
@@ -25,11 +24,6 @@ def test_a_position_is_usable_or_blind_or_neither(status: str, radius_m: float) 
     close = radius_m <= 0.30
     assert is_usable(status, radius_m) == (status == "TRACKING" or (status == "DEGRADED" and close))
     assert is_blind(status, radius_m) == (status in ("LOST", "AMBIGUOUS") or (status == "DEGRADED" and not close))
-
-
-def test_where_there_is_no_map_nobody_searches() -> None:
-    clock = SearchClock()
-    assert not any(clock.handle(n * 10**9, is_found=False, is_driving=True, may_be_mapped=False) for n in range(100))
 
 
 def test_a_speed_that_nobody_knows_is_driving() -> None:

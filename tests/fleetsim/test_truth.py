@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration
 from fleetsim.motion import Route, RouteMotion
 from fleetsim.renderer import Painter, RigRenderer, make_optics
 from fleetsim.scene.layout import Layout
@@ -25,16 +25,6 @@ BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 def small_world() -> World:
     """Two aisles of four bays."""
     return World(Layout(aisles=2, bays=4), seed=3)
-
-
-def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, RigRenderer]:
-    world = small_world()
-    y = world.layout.aisle_y_m(0), world.layout.aisle_y_m(1)
-    route = Route(((2.7, y[0]), (20.0, y[0]), (20.0, y[1]), (12.0, y[1])))
-    kind = replace(ROBOTS["surveyor"], lens=lens)
-    motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
-    rig = nominal_calibration(kind)
-    return rig, RigRenderer(world, rig, motion, has_blur=has_blur)
 
 
 def _track(
@@ -53,8 +43,13 @@ def _track(
     [*((lens, False) for lens in ("pinhole", "radial-tangential", "equidistant", "double-sphere")), ("pinhole", True)],
 )
 def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
-    rig, renderer = _renderer(lens, has_blur=has_blur)
-    left, right = rig.cameras
+    world = small_world()
+    y = world.layout.aisle_y_m(0), world.layout.aisle_y_m(1)
+    route = Route(((2.7, y[0]), (20.0, y[0]), (20.0, y[1]), (12.0, y[1])))
+    kind = replace(ROBOTS["surveyor"], lens=lens)
+    motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
+    rig = nominal_calibration(kind)
+    renderer, (left, right) = RigRenderer(world, rig, motion, has_blur=has_blur), rig.cameras
     epipolar_px, temporal_px, stereo_px = [], [], []
     for moment_s in MOMENTS_S:
         (shot, beside), (later, _) = renderer.shoot(moment_s), renderer.shoot(moment_s + 0.05)

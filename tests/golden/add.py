@@ -1,29 +1,26 @@
-"""Adds the files of formats that have none yet; never writes one again. `python tests/golden/add.py`, once for each new format."""
+"""Adds the files of formats that have none yet; never writes one again. `PYTHONPATH=tests python -m golden.add` for each new format."""
 
 import json
-import sys
 import tempfile
 from pathlib import Path
 
-GOLDEN = Path(__file__).resolve().parent
-sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in ("shared", ""))]
+import msgspec
+import numpy as np
 
-import msgspec  # noqa: E402
-import numpy as np  # noqa: E402
+from fleetmap.mapformat.manifest import MANIFEST_FORMAT
+from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile, encode_tile
+from fleetmap.mapformat.version_file import EXPORT_FORMAT
+from fleetmap.messages import FailureReport, Thumbnail
+from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
+from mapserver import releases
+from mapserver.fleet.fleet import Fleet
+from mapserver.quality.figures import Comparison, Evidence, ProbeFigures, TrajectoryBreaks
+from mapserver.store import DraftContent, MapStore
+from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive
+from support.storage.dense_samples import surfel_extras, wall
+from support.storage.map_samples import draft_details, random_survey, random_tile
 
-from fleetmap.mapformat.manifest import MANIFEST_FORMAT  # noqa: E402
-from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
-from fleetmap.mapformat.version_file import EXPORT_FORMAT  # noqa: E402
-from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
-from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report  # noqa: E402
-from mapserver import releases  # noqa: E402
-from mapserver.fleet.fleet import Fleet  # noqa: E402
-from mapserver.quality.figures import Comparison, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
-from mapserver.store import DraftContent, MapStore  # noqa: E402
-from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
-from support.storage.dense_samples import surfel_extras, wall  # noqa: E402
-from support.storage.map_samples import draft_details, random_survey, random_tile  # noqa: E402
-
+GOLDEN = Path(__file__).parent
 _LOOKS = ProbeFigures(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
 EVIDENCE = Evidence(held_out=Comparison(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBreaks(100, 0, 0.01))
 
@@ -72,16 +69,6 @@ def write_tile(path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps(meaning, indent=1) + "\n")
 
 
-def add_from_store(folder: Path) -> None:
-    """Manifest and export."""
-    write_store(folder)
-    with MapStore.open(folder) as store:
-        if not (path := GOLDEN / f"manifest-{MANIFEST_FORMAT}.json").exists():
-            path.write_bytes(store.blob(store.version("lab", 1).manifest_sha256))
-        if not (path := GOLDEN / f"version-{EXPORT_FORMAT}.fmex").exists():
-            store.export_version("lab", 1, path)
-
-
 if __name__ == "__main__":
     if not (tile_path := GOLDEN / f"tile-{TILE_FORMAT}.fmtl").exists():
         write_tile(tile_path)
@@ -89,4 +76,9 @@ if __name__ == "__main__":
         survey = random_survey(np.random.default_rng(3), keyframes=3, landmarks=8)
         archive_path.write_bytes(encode_archive(survey))
     with tempfile.TemporaryDirectory() as made:
-        add_from_store(Path(made) / "store")
+        write_store(Path(made) / "store")
+        with MapStore.open(Path(made) / "store") as store:
+            if not (path := GOLDEN / f"manifest-{MANIFEST_FORMAT}.json").exists():
+                path.write_bytes(store.blob(store.version("lab", 1).manifest_sha256))
+            if not (path := GOLDEN / f"version-{EXPORT_FORMAT}.fmex").exists():
+                store.export_version("lab", 1, path)

@@ -1,19 +1,16 @@
 """Whether maps and estimates are the same before and after a change: hashes of six recordings' tiles, manifests and estimates.
 
-`PYTHONPATH=tests python tests/golden/equality.py [NAME...] [--work FOLDER] [--out FILE.json] [--against FILE.json]`: a stereo pair, front
-and rear pairs, a pair and a depth camera, RGB-D, one camera with an IMU, and two floors. Exit status 1 where a hash differs from that of
-`--against`, which other code wrote on the same machine: other processors round otherwise. Recordings of the simulator are made once in
-the work folder; the two real ones are left out, loudly, where they are missing.
+`PYTHONPATH=tests python -m golden.equality [--only NAME...] [--work FOLDER] [--out FILE.json]`: a stereo pair, front and rear pairs, a
+pair and a depth camera, RGB-D, one camera with an IMU, and two floors. `diff` names the hashes that differ from those that other code
+wrote on the same machine: other processors round otherwise. Recordings of the simulator are made once in the work folder; the two real
+ones are left out, loudly, where they are missing.
 """
 
 import benchmarks  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
 import hashlib
-import json
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable
@@ -23,7 +20,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from benchmarks.common.recorded_runs import kept_folder, recorded, tool
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, tool
 from fleetmap.encoding import to_json
 from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.recordings import open_recording
@@ -109,8 +106,8 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
                 yield outcome.estimate
 
 
-def figures(name: str, work: Path, store: Path) -> dict[str, str] | None:
-    """The hashes of one recording; None where it is missing."""
+def figures(name: str, work: Path, store: Path) -> dict[str, str]:
+    """The hashes of one recording."""
     if name == FLOORS:
         tower = {
             f"{site} {what}": sha256
@@ -123,7 +120,7 @@ def figures(name: str, work: Path, store: Path) -> dict[str, str] | None:
     if name in REAL:
         folder, sensors = REAL[name]
         if not (DATA / folder).is_dir():
-            return None
+            return {"NOT COMPARED": f"{folder} not found in {DATA}"}
         map_of = built(DATA / folder, store, name, "--use", sensors, "--frames", "::2")
         return map_of | hashed(
             localize(DATA / folder, store, name, options=LocalizeOptions(frames="1:200:2")).estimates
@@ -133,36 +130,10 @@ def figures(name: str, work: Path, store: Path) -> dict[str, str] | None:
     return built(recorded(work, rig, "clip"), store, name) | hashed(localize(drive, store, name).estimates)
 
 
-def main() -> None:
-    """Print and write the hashes; compare them."""
-    names = [*RIGS, *REAL, FLOORS]
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", choices=[[], *names])
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--against", type=Path)
-    given = parser.parse_args()
-    given.work.mkdir(parents=True, exist_ok=True)
-    found, differ = dict[str, dict[str, str]](), list[str]()
-    before = json.loads(given.against.read_text("utf-8")) if given.against else {}
-    for name in given.names or names:
+@benchmark([*RIGS, *REAL, FLOORS])
+def main(options: Options) -> Results:
+    found: Results = {}
+    for name in options.only:
         with tempfile.TemporaryDirectory() as folder:
-            figure = figures(name, given.work, Path(folder) / "store")
-        if figure is None:
-            print(f"{name}: NOT COMPARED, {REAL[name][0]} not found in {DATA}")
-            continue
-        found[name] = figure
-        if name in before:
-            differ += [
-                f"{name}: {what}" for what in before[name].keys() | figure if before[name].get(what) != figure.get(what)
-            ]
-    print(json.dumps(found, indent=1))
-    if given.out is not None:
-        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    if given.against is not None:
-        print("\n".join(sorted(differ)) or f"{len(found)} recordings: equal to the byte")
-    sys.exit(1 if differ else 0)
-
-
-if __name__ == "__main__":
-    main()
+            found[name] = figures(name, options.work, Path(folder) / "store")
+    return found

@@ -47,7 +47,16 @@ def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[i
     made = _made(missing, int(os.environ.get("JOBS") or 1))
     for row in track(made, name, len(missing), console=Console(stderr=True), disable=len(cases) < 2):
         rows[row["case"]] = row
-        _keep(path, [rows[c] for c in cases if c in rows], seeds)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        versions = {package: importlib.metadata.version(package) for package in _VERSIONS}
+        about = {
+            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            "python": platform.python_version(),
+        } | versions
+        known = {"about": about, "seeds": list(seeds), "rows": [rows[c] for c in cases if c in rows]}
+        beside = path.with_suffix(".part")
+        beside.write_text(json.dumps(known, indent=1) + "\n")
+        beside.replace(path)
     return [rows[case] for case in cases if case in rows]
 
 
@@ -70,15 +79,6 @@ def _timed(case: str, make: Callable[[], Row]) -> Row:
 def _cpu_s() -> float:
     """Of this process and of those that it waited for."""
     return sum(os.times()[:4])
-
-
-def _keep(path: Path, rows: list[Row], seeds: Sequence[int]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    versions = {package: importlib.metadata.version(package) for package in _VERSIONS}
-    about = {"machine": f"{platform.machine()}, {os.cpu_count()} cores", "python": platform.python_version()} | versions
-    beside = path.with_suffix(".part")
-    beside.write_text(json.dumps({"about": about, "seeds": list(seeds), "rows": rows}, indent=1) + "\n")
-    beside.replace(path)
 
 
 def table(rows: Sequence[Row], columns: Sequence[Column]) -> str:

@@ -68,7 +68,9 @@ def cases() -> dict[str, partial[Row]]:
             for n, s in _round(number)
         }
     for number, situation in itertools.chain.from_iterable(map(_round, range(_ROUNDS))):
-        for name in [name for name in CONFIGURATIONS if _is_ablated(situation, number, name)]:
+        is_short = SITUATIONS[situation].length_m < _SHORT_M
+        is_ablated = number < (_ABLATED_SHORT if is_short else _ABLATED)
+        for name in [name for name in CONFIGURATIONS if is_ablated and name != FULL]:
             one = partial(row_of, situation, SEEDS[0], number, CONFIGURATIONS[name])
             out[f"{situation}, {number}: {name}"] = one
     return out
@@ -81,12 +83,6 @@ def _round(number: int) -> list[tuple[int, str]]:
         begin, end = (about.drives * n // _ROUNDS for n in (number, number + 1))
         drives += [(about.day(n), about.length_m, n, situation) for n in range(begin, end)]
     return [(n, situation) for *_, n, situation in sorted(drives)]
-
-
-def _is_ablated(situation: str, number: int, name: str) -> bool:
-    """Whether another configuration than the whole system drives it."""
-    is_short = SITUATIONS[situation].length_m < _SHORT_M
-    return name != FULL and number < (_ABLATED_SHORT if is_short else _ABLATED)
 
 
 def own(rows: list[Row], situation: str, name: str) -> list[Row]:

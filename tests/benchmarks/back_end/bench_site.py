@@ -43,12 +43,12 @@ def measure(drive: Path, keyframes: int) -> dict[str, Any]:
         begun_s = time.process_time()
         with drawn_alignment(survey):
             made = survey.surveyed(SETTINGS, SurveyTools(images=store, executor=executor))
-        cpu_s, peak_mb = time.process_time() - begun_s, _peak_mb()
+        cpu_s, status = time.process_time() - begun_s, Path("/proc/self/status").read_text()
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
     return {
         "keyframes": len(survey.odometry.keyframes),
         "cpu_s": cpu_s,
-        "peak_mb": peak_mb,
+        "peak_mb": float(status.split("VmHWM:")[1].split()[0]) / 1024,
         "loops": len(made.loops.edges),
         "wrong_loops": wrong_loops(made.loops.edges, survey),
         "ate_m": ate_m(made.state.map_from_body, truth),
@@ -90,11 +90,6 @@ def measured(size: int, drive: Path) -> dict[str, Any]:
 def slope(rows: list[dict[str, Any]], key: str) -> float:
     """Of the log-log fit over the keyframes."""
     return float(np.polyfit(np.log([r["keyframes"] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
-
-
-def _peak_mb() -> float:
-    status = Path("/proc/self/status").read_text()
-    return float(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 @benchmark(several="keyframes", frames=12_600)

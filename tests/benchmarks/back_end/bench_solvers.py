@@ -25,6 +25,7 @@ from support.recordings.realdata import DATA
 from support.worlds.bundle_gtsam import gtsam_graph
 from support.worlds.bundle_scene import disturbed
 from support.worlds.corridor_scene import scene
+from support.worlds.pose_graph_scene import driven
 
 Figures = dict[str, float]
 T = TypeVar("T")
@@ -51,25 +52,16 @@ def pose_graphs() -> dict[str, Figures]:
     for name in GRAPHS:
         map_from_body, edges = parse_g2o((DATA / "pose_graphs" / f"{name}.g2o").read_text())
         seconds, own = timed(lambda: optimize_pose_graph(map_from_body, edges, robust=False))  # noqa: B023
-        starts = {"odometry": _chained(map_from_body, edges), "shaken": _shaken(own.map_from_body)}
-        costs = [optimize_pose_graph(start, edges, robust=False).cost for start in starts.values()]
+        following = {e.i: e.i_from_j for e in edges if e.j == e.i + 1}
+        odometry = driven([following[k] for k in range(len(map_from_body) - 1)], map_from_body[0])
+        rng = np.random.default_rng(4)
+        shifts = [se3(so3_exp(0.1 * rng.normal(size=3)), rng.normal(size=3)) for _ in map_from_body]
+        starts = odometry, own.map_from_body @ np.array(shifts)
+        costs = [optimize_pose_graph(start, edges, robust=False).cost for start in starts]
         best = min([own.cost, *costs])
         found[name] = {"cost": own.cost, "above_best": own.cost / best - 1.0, "cpu_s": seconds}
         found[name] |= _with_wrong_loops(map_from_body, edges, own.map_from_body)
     return found
-
-
-def _chained(map_from_body: Array, edges: list[PoseEdge]) -> Array:
-    following = {e.i: e.i_from_j for e in edges if e.j == e.i + 1}
-    places = [map_from_body[0]]
-    for k in range(len(map_from_body) - 1):
-        places.append(places[-1] @ following[k])
-    return np.array(places)
-
-
-def _shaken(map_from_body: Array) -> Array:
-    rng = np.random.default_rng(4)
-    return np.array([placed @ se3(so3_exp(0.1 * rng.normal(size=3)), rng.normal(size=3)) for placed in map_from_body])
 
 
 def _with_measured_noise(edges: list[PoseEdge], clean: Array) -> list[PoseEdge]:

@@ -26,7 +26,7 @@ from mapserver.survey.merge.membership import MembershipTest, SessionKeyframes
 from mapserver.survey.odometry_pass import FrameChain
 from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from support.estimator.landmarks import LandmarkField, Landmarks
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 RATE_HZ = 7.5
@@ -120,11 +120,10 @@ def _world(scenario: str, seed: int, day: int) -> World:
 
 def session(site: Site, day: int, route: Route, name: str, robot: str = "surveyor") -> EstimatorSession:
     """A run of a robot of this name along a route on a day; names make noise of their own."""
-    base, own = SCENARIOS[site.scenario](), f"{site.scenario}-joining"
-    here = replace(base, runs={name: Run(robot, (route,), rate_hz=RATE_HZ)})
+    here = replace(SCENARIOS[site.scenario](), runs={name: Run(robot, (route,), rate_hz=RATE_HZ)})
     world = _world(site.scenario, site.seed, day)
-    with patch.dict(SCENARIOS, {own: lambda: here}), patch.object(recorder, "World", lambda *_, **__: world):
-        prepared = recorder.prepare(recorder.Order(own, seed=site.seed, day=day))
+    with patch.object(recorder, "World", lambda *_, **__: world):
+        prepared = unpictured(recorder.Order(f"{site.scenario}-joining", seed=site.seed, day=day), here)
     return EstimatorSession(prepared, field=_field(site.scenario, site.seed, day))
 
 

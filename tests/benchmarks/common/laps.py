@@ -1,40 +1,32 @@
 """A recording driven again and again: left and entered where place, heading and velocity agree, stamps going on."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, decode_frame
+from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
 
 
 @dataclass(frozen=True)
-class _Laps:
+class _Laps(WrappedFrames):
     """The frames of a recording, the last ones again and again: index (F,) of each, and by how much its stamp is later (F,)."""
 
-    recording: Recording
     index: NDArray[np.int64]
     later_ns: NDArray[np.int64]
 
     def stored(self, index: int) -> StoredFrame:
-        frame = self.recording.stored_frame(int(self.index[index]))
+        frame = self.source.stored(int(self.index[index]))
         return replace(frame, stamp_ns=frame.stamp_ns + int(self.later_ns[index]))
 
     def frame(self, index: int) -> CameraFrame:
         return decode_frame(self.stored(index))
 
     def part(self, indices: NDArray[np.int64]) -> "_Laps":
-        part = self.recording.part(self.index[indices])
-        return _Laps(part, np.arange(len(indices)), self.later_ns[indices])
-
-    def hash_into(self, digest: Any) -> None:
-        self.recording.frames.hash_into(digest)
-
-    def close(self) -> None:
-        self.recording.close()
+        return _Laps(self.source.part(self.index[indices]), np.arange(len(indices)), self.later_ns[indices])
 
 
 def repeated(recording: Recording, laps: int, seam: tuple[int, int] | None = None) -> Recording:
@@ -61,7 +53,7 @@ def repeated(recording: Recording, laps: int, seam: tuple[int, int] | None = Non
     wheel_rows, wheel_ns = again(np.array([sample.stamp_ns for sample in recording.wheel], np.int64))
     return replace(
         recording,
-        frames=_Laps(recording, index, later_ns),
+        frames=_Laps(recording.frames, index, later_ns),
         frame_stamps_ns=stamps_ns[index] + later_ns,
         imu=ImuSamples(imu_ns, recording.imu.gyro_radps[imu_rows], recording.imu.accel_mps2[imu_rows]),
         wheel=tuple(

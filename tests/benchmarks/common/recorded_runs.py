@@ -52,7 +52,10 @@ def benchmark(names: Iterable[str] = (), several: str = "", **numbers: int) -> C
         options = parser.parse_args()
         options.only = options.only or list(names)
         options.work.mkdir(parents=True, exist_ok=True)
-        write_results(options.out, measure(options))
+        text = json.dumps(measure(options), indent=2) + "\n"
+        print(text)
+        if options.out is not None:
+            options.out.write_text(text, encoding="utf-8")
         return measure
 
     return run
@@ -70,14 +73,6 @@ def resident_mb() -> dict[str, float]:
     """10^6 bytes of this process in memory, and of those what is not mapped from disk."""
     now = psutil.Process().memory_info()
     return {"resident": now.rss / 1e6, "anonymous": (now.rss - now.shared) / 1e6}
-
-
-def write_results(path: Path | None, results: Results) -> None:
-    """Print the results as JSON, and write them where a file is asked for."""
-    text = json.dumps(results, indent=2) + "\n"
-    print(text)
-    if path is not None:
-        path.write_text(text, encoding="utf-8")
 
 
 def tool(name: str) -> list[str]:

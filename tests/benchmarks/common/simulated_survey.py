@@ -22,8 +22,8 @@ from fleetmap.geometry import Array
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import wheel_between
-from fleetsim import recorder
 from fleetsim.motion import Route
+from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS
 from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside
@@ -33,7 +33,7 @@ from mapserver.survey.stages import Survey, adjust_chain, finish_survey
 from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.tracks import tracks
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, unpictured
 
 _ALIGNED_PX, _DISPARITY_PX = (
     0.2,
@@ -126,8 +126,8 @@ def session_of(
     base, name = SCENARIOS[scenario](), "+".join(robots)
     runs = [base.runs[robot] for robot in robots]
     joined = replace(runs[0], rate_hz=rate_hz, routes=(_one_after_the_other([run.routes[0] for run in runs]),))
-    with patch.dict(SCENARIOS, {scenario: lambda: replace(base, runs={name: joined})}):
-        return EstimatorSession(recorder.prepare(recorder.Order(scenario, seed=seed, robot=name, frames=frames)))
+    order = Order(scenario, seed=seed, robot=name, frames=frames)
+    return EstimatorSession(unpictured(order, replace(base, runs={name: joined})))
 
 
 def _one_after_the_other(routes: Sequence[Route]) -> Route:

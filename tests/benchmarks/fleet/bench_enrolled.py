@@ -23,23 +23,6 @@ from support.storage.map_samples import save_sample_draft
 SITE, ENDPOINT = "lab", "tls/127.0.0.1:7447"
 
 
-def open_register(folder: Path) -> tuple[MapStore, RobotRegister]:
-    """A store with one draft, keys and authorities."""
-    store = MapStore.open(folder / "store", create=True)
-    save_sample_draft(store)
-    init_here(store)
-    register = RobotRegister(store)
-    register.authorities.init(["127.0.0.1"], None, None)
-    return store, register
-
-
-def robot_files(register: RobotRegister, holder: Holder, folder: Path) -> TlsFiles:
-    """An enrolled robot's key and certificate."""
-    own = folder / f"{holder.certificate}.pem"
-    own.write_bytes(register.authorities.make_own(holder.certificate, "robot"))
-    return TlsFiles(folder / "store" / "keys" / "servers-ca.crt", own)
-
-
 def _until(condition: Callable[[], bool], within_s: float = 20.0) -> float:
     begun_s = time.perf_counter()
     while not condition():
@@ -51,7 +34,11 @@ def _until(condition: Callable[[], bool], within_s: float = 20.0) -> float:
 
 def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, float]:
     """With `count` enrolled robots: seconds to open, memory (MB); seconds until a revoked one is out and all others are answered."""
-    store, register = open_register(folder)
+    store = MapStore.open(folder / "store", create=True)
+    save_sample_draft(store)
+    init_here(store)
+    register = RobotRegister(store)
+    register.authorities.init(["127.0.0.1"], None, None)
     names = [f"r{number}" for number in range(count)]
     register.enrol(SITE, names, ENDPOINT)
     holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
@@ -69,7 +56,11 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
             guard.follow()
 
     threading.Thread(target=follow, daemon=True).start()
-    robots = [Bus(bus.endpoint, tls=robot_files(register, holder, folder)).open() for holder in holders]
+    robots = []
+    for holder in holders:
+        own = folder / f"{holder.certificate}.pem"
+        own.write_bytes(register.authorities.make_own(holder.certificate, "robot"))
+        robots.append(Bus(bus.endpoint, tls=TlsFiles(folder / "store" / "keys" / "servers-ca.crt", own)).open())
 
     def answered(number: int) -> bool:
         try:

@@ -39,15 +39,6 @@ _LISTS = ("/v1/sites", f"/v1/sites/{SITE}/versions", "/v1/robots")
 _PROCESSES, _TIMEOUT_S, _PATIENCE_S = 2, 20.0, 120.0
 
 
-def site_tiles(site_mb: float) -> list[Tile]:
-    """Tiles of about so many megabytes."""
-    rng = np.random.default_rng(0)
-    count = max(1, round(site_mb * 1e6 / _TILE_BYTES))
-    side = int(np.ceil(np.sqrt(count)))
-    cells = [(n % side, n // side) for n in range(count)]
-    return [random_tile(rng, landmarks=_TILE_LANDMARKS, places=12, cell=cell) for cell in cells]
-
-
 def publish(folder: Path, tiles: list[Tile]) -> None:
     """Makes a version of these current, as another process than the server."""
     content = DraftContent(tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
@@ -138,7 +129,10 @@ def announced(endpoint: str) -> Iterator[None]:
 
 def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, float]]:
     """Everybody fetches the whole site, the delta of a night, a night in which nothing moved, and the whole site again."""
-    publish(folder, site_tiles(site_mb))
+    rng, count = np.random.default_rng(0), max(1, round(site_mb * 1e6 / _TILE_BYTES))
+    side = int(np.ceil(np.sqrt(count)))
+    cells = [(n % side, n // side) for n in range(count)]
+    publish(folder, [random_tile(rng, landmarks=_TILE_LANDMARKS, places=12, cell=cell) for cell in cells])
     context, rows = multiprocessing.get_context("spawn"), dict[str, dict[str, float]]()
     said = context.Queue()
     with serving(folder) as served:

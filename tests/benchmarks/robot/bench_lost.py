@@ -21,7 +21,6 @@ from benchmarks.robot.aliased_starts import within_budget
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.source import ReplaySource
 from fleetsim.motion import Route
@@ -34,6 +33,7 @@ from locclient.replay import run_metrics
 from studies.robot_days.drives import judged
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, unpictured
+from support.recordings.spoiled_recording import without_imu
 
 LAYOUT = Layout(aisles=4, bays=8, are_aisles_identical=True)
 _NAME, _END_M, _BEGIN_S, _AFTER_S = "lost", 2.7, 8.0, 12.0
@@ -138,12 +138,6 @@ def _pushed(seed: int, number: int) -> Outcome:
     return _driven(seed, pushed, has_imu=True, has_wheels=number % 2 == 0)[0]
 
 
-class _WithoutImu(ReplaySource):
-    @property
-    def calibration(self) -> RigCalibration:
-        return replace(self.recording.calibration, imu=None)
-
-
 def _kept(count: int, share: float, in_bursts: bool, rng: np.random.Generator) -> NDArray[np.int64]:
     """Numbers of the frames that arrive."""
     kept = np.ones(count, bool) if in_bursts else rng.random(count) >= share
@@ -161,8 +155,8 @@ def _dropped(work: Path, share: float) -> Callable[[int, int], Outcome]:
         rng, store = np.random.default_rng([seed, 4, int(100 * share), number]), surveyed(work)
         with open_recording(recorded(work, ("--robot", "runner-1", "--day", "1"))) as recording:
             frames = _kept(len(recording.frame_stamps_ns), share, number % 4 >= 2, rng)
-            source = (_WithoutImu if number % 2 else ReplaySource)(recording, frames, reverse=False)
-            result = replayed(source, store)
+            seen = without_imu(recording) if number % 2 else recording
+            result = replayed(ReplaySource(seen, frames, reverse=False), store)
         tracking = float(np.mean([frame.status is Status.TRACKING for frame in result.frames]))
         says_carried = any(e.cause == "carried" for e in result.estimates)
         silent = run_metrics.silent_failures(result.frames) or 0

@@ -84,13 +84,6 @@ def start_at(
     return start.named, judged(number, session, estimates)
 
 
-def in_aisles(site: Site, count: int) -> list[int]:
-    """Frames of the drive between racks, not in the turns between two aisles."""
-    layout, x_m = site.robot.session.world.layout, site.robot.map_from_body[30:-160, 0, 3]
-    inside = 30 + np.flatnonzero((layout.end_m < x_m) & (x_m < layout.bay_x_m(layout.bays)))
-    return [int(inside[k]) for k in np.linspace(0, len(inside) - 1, count).astype(int)]
-
-
 @benchmark(KINDS, starts=100, seed=31)
 def main(arguments: Options) -> Results:
     figures, sites = {}, dict[str, Site]()
@@ -99,7 +92,12 @@ def main(arguments: Options) -> Results:
         if scenario not in sites:
             sites[scenario] = surveyed_site(scenario, arguments.seed)
         site, rng = sites[scenario], np.random.default_rng([arguments.seed, 2])
-        found = [start_at(site, number, moved_m, duration_s, rng) for number in in_aisles(site, arguments.starts)]
+        layout, x_m = site.robot.session.world.layout, site.robot.map_from_body[30:-160, 0, 3]
+        inside = 30 + np.flatnonzero(
+            (layout.end_m < x_m) & (x_m < layout.bay_x_m(layout.bays))
+        )  # not in turns between aisles
+        numbers = inside[np.linspace(0, len(inside) - 1, arguments.starts).astype(int)].tolist()
+        found = [start_at(site, number, moved_m, duration_s, rng) for number in numbers]
         times_s = [start.tracking_s for _, start in found]
         figures[name] = {
             "starts": len(found),

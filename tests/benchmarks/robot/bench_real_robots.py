@@ -7,7 +7,7 @@ the process's.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,6 @@ from support.room_site import KNOWN_RIG
 
 MAPPED, UNSEEN = "0::2", "1::2"
 _STARTS = 20
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """How the odd frames of a recording are met."""
-
-    recording: str
-    how: Callable[[Path, Path], dict[str, Any]]
 
 
 def drive(path: Path, store: Path, *, reverse: bool) -> dict[str, Any]:
@@ -63,14 +55,11 @@ def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
     }
 
 
-CASES: dict[str, Case] = {
-    "euroc_v101_keyframes, held out": Case(
-        "euroc_v101_keyframes", lambda path, store: drive(path, store, reverse=False)
-    ),
-    "euroc_mh01_start, held out, backwards": Case(
-        "euroc_mh01_start", lambda path, store: drive(path, store, reverse=True)
-    ),
-    "euroc_mh01_start, first fix from nothing": Case("euroc_mh01_start", start_anywhere),
+# How the odd frames of a recording are met.
+CASES: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
+    "euroc_v101_keyframes, held out": partial(drive, reverse=False),
+    "euroc_mh01_start, held out, backwards": partial(drive, reverse=True),
+    "euroc_mh01_start, first fix from nothing": start_anywhere,
 }
 
 
@@ -84,6 +73,6 @@ def robots_map(work: Path, path: Path, frames: str = MAPPED) -> Path:
 def main(arguments: Options) -> Results:
     found = {}
     for name in arguments.only:
-        folder = DATA / CASES[name].recording
-        found[name] = CASES[name].how(folder, robots_map(arguments.work, folder))
+        folder = DATA / name.partition(",")[0]
+        found[name] = CASES[name](folder, robots_map(arguments.work, folder))
     return {"cases": found}

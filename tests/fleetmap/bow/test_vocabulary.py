@@ -14,15 +14,10 @@ from fleetmap.errors import MapFormatError, NewerFormatError
 from support.worlds.vocabulary_training import encode_vocabulary, train_vocabulary
 
 
-def _clustered(rng: np.random.Generator, clusters: int, each: int, noise: float = 0.05) -> np.ndarray:
-    centres = rng.integers(0, 256, (clusters, 32), dtype=np.uint8)
-    flips = np.packbits(rng.random((clusters * each, 256)) < noise, axis=1)
-    return np.repeat(centres, each, axis=0) ^ flips
-
-
 def _trained(seed: int = 0, clusters: int = 40, each: int = 30) -> tuple[Vocabulary, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    descriptors = _clustered(rng, clusters, each)
+    centres = rng.integers(0, 256, (clusters, 32), dtype=np.uint8)
+    descriptors = np.repeat(centres, each, axis=0) ^ np.packbits(rng.random((clusters * each, 256)) < 0.05, axis=1)
     images = rng.integers(0, 12, len(descriptors))
     return train_vocabulary(descriptors, 4, 3, np.random.default_rng(7), images), descriptors, images
 

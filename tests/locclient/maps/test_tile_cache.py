@@ -1,7 +1,8 @@
 """The robot's cache trusts neither its disk nor its size: a read-only disk, or files of another account, keep its map usable."""
 
+import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,21 +123,15 @@ def test_a_damaged_record_is_told_and_forgotten(tmp_path: Path, text: bytes) -> 
     assert "damaged" in again.last_fault
 
 
-class Failing:
-    """Lets so many calls through; all others fail with `error`."""
+def failing(real: Callable[..., object], left: Iterator[int], error: BaseException) -> Callable[..., object]:
+    """Lets calls through until none is left; all others fail."""
 
-    def __init__(self, calls: int, error: BaseException) -> None:
-        self.left = calls
-        self.error = error
+    def call(*arguments: object, **options: object) -> object:
+        if next(left) <= 0:
+            raise error
+        return real(*arguments, **options)
 
-    def wrap(self, real: Callable[..., object]) -> Callable[..., object]:
-        def call(*arguments: object, **options: object) -> object:
-            self.left -= 1
-            if self.left < 0:
-                raise self.error
-            return real(*arguments, **options)
-
-        return call
+    return call
 
 
 @pytest.mark.parametrize(
@@ -150,10 +145,10 @@ def test_a_failure_at_any_moment_leaves_a_whole_version(
         folder = tmp_path / str(calls)
         cache = TileCache(folder)
         cache.activate("lab", 1, [put(cache, b"old")])
-        failing, is_finished = Failing(calls, error), False
+        left, is_finished = itertools.count(calls, -1), False
         with monkeypatch.context() as patch:
             for owner, name in ((os, "fsync"), (os, "open"), (Path, "open"), (Path, "replace"), (Path, "mkdir")):
-                patch.setattr(owner, name, failing.wrap(getattr(owner, name)))
+                patch.setattr(owner, name, failing(getattr(owner, name), left, error))
             try:
                 cache.activate("lab", 2, [put(cache, b"new"), put(cache, b"more")])
                 is_finished = True

@@ -12,7 +12,6 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
-from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, WheelSample
@@ -23,7 +22,7 @@ from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 from support.recordings.painted_room import standing_first, write_ride
-from support.recordings.spoiled_recording import changed, without_imu
+from support.recordings.spoiled_recording import changed, imu, without_imu
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
 Change = Callable[[Recording], Recording]
@@ -60,16 +59,6 @@ def remembered(look: Callable[..., object], seen: dict[object, object]) -> Calla
         return seen[key]
 
     return remember
-
-
-def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Change:
-    """Samples multiplied by matrices (3, 3) or numbers."""
-    by_accel, by_gyro = (np.eye(3) * by if np.ndim(by) < 2 else by for by in (accel, gyro))
-
-    def changed(of: ImuSamples) -> ImuSamples:
-        return ImuSamples(of.stamps_ns, of.gyro_radps @ by_gyro.T, of.accel_mps2 @ by_accel.T)
-
-    return lambda r: replace(r, imu=changed(r.imu))
 
 
 def wheels(speed: float = 1.0, yaw: float = 1.0) -> Change:

@@ -3,31 +3,22 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.sensors.samples import ImuSamples
 from mapserver.drafting.admission import CheckedRecording, checked
 from mapserver.drafting.survey_recordings import BegunSurvey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
 from support.recordings.calibration_faults import swapped
 from support.recordings.realdata import real_data
+from support.recordings.spoiled_recording import imu, with_clock_shift
 
-X, Y = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])
-
-
-def imu(gyro: Array | float = 1.0, accel: Array | float = 1.0, late_ns: int = 0) -> Callable[[Recording], Recording]:
-    """Samples times factors, one for each axis or for all, with other stamps."""
-
-    def changed(of: ImuSamples) -> ImuSamples:
-        return ImuSamples(of.stamps_ns + late_ns, of.gyro_radps * gyro, of.accel_mps2 * accel)
-
-    return lambda recording: replace(recording, imu=changed(recording.imu))
+X, Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
 
 
 def wider(recording: Recording) -> Recording:
@@ -49,7 +40,7 @@ def test_a_sound_drive_has_nothing_to_warn_of() -> None:
 
 
 def test_a_clock_that_is_late_is_warned_of_and_corrected() -> None:
-    found = admitted(imu(late_ns=20_000_000))
+    found = admitted(partial(with_clock_shift, shift_s=0.02))
     assert {f.name for f in found.findings if f.verdict == "warn"} == {"camera-imu time offset", "time offset"}
     assert found.corrections == {"time offset": pytest.approx(0.02, abs=5e-4)}
 

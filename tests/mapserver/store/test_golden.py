@@ -26,7 +26,7 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 def test_every_format_has_its_file() -> None:
     files = f"tile-{TILE_FORMAT}.fmtl", f"manifest-{MANIFEST_FORMAT}.json", f"archive-{ARCHIVE_FORMAT}.fmar"
     for name in (*files, f"version-{EXPORT_FORMAT}.fmex"):
-        assert (GOLDEN / name).is_file(), f"{name}: python tests/golden/add.py adds the newest"
+        assert (GOLDEN / name).is_file(), f"{name}: python -m golden.add adds the newest"
 
 
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("tile-*.fmtl")), ids=lambda file: file.stem)

@@ -48,13 +48,6 @@ def surveyed(name: str, views: int, rig: str = "front-rear") -> tuple[SimulatedS
         return made, made.surveyed(SETTINGS)
 
 
-def robots_view(made: SimulatedSurvey, done: Survey) -> MapView:
-    """The survey as robots have it, in the frame of the truth at its beginning."""
-    shift = made.map_from_body[0] @ se3_inverse(done.map.trajectory.frame_from_body[0])
-    tiles = tiles_from_survey(done.map.transformed(shift))
-    return MapView(tiles, default_vocabulary(), done.map.camera.focal_px)
-
-
 def steps_off_m(made: SimulatedSurvey, done: Survey) -> float:
     """Root mean square error of all frames' positions as seen from the middle one."""
 
@@ -67,7 +60,11 @@ def steps_off_m(made: SimulatedSurvey, done: Survey) -> float:
 
 def found(robot: EstimatorSession, views: int, rig: str, within_m: float) -> int:
     """In how many frames of another day's view a robot finds itself by the landmarks of a survey's first views; never elsewhere."""
-    relocalizer = SessionRelocalizer(robots_view(*surveyed(_ALONG, views, rig)), robot, ROBOT)
+    made, done = surveyed(_ALONG, views, rig)
+    shift = made.map_from_body[0] @ se3_inverse(done.map.trajectory.frame_from_body[0])  # the truth at its beginning
+    tiles = tiles_from_survey(done.map.transformed(shift))
+    view = MapView(tiles, default_vocabulary(), done.map.camera.focal_px)
+    relocalizer = SessionRelocalizer(view, robot, ROBOT)
     count = 0
     for number in range(0, len(robot), 4):
         fixes = finished(relocalizer.anywhere(finished(relocalizer.extract(blank(robot, number)))))

@@ -47,8 +47,6 @@ class Servers:
         shutil.copytree(self.folders[0] / "keys", self.folders[1] / "keys")
         self._endpoints = [with_free_port("tcp/127.0.0.1:0") for _ in self.folders]
         self._processes = [self._started(number) for number in range(2)]
-        for process in self._processes:
-            wait_until_ready(process)
         self.endpoint, self._loop = with_free_port("tcp/127.0.0.1:0"), asyncio.new_event_loop()
         threading.Thread(target=self._balance, daemon=True).start()
 
@@ -57,7 +55,6 @@ class Servers:
         self._processes[number].kill()
         self._processes[number].wait()
         self._processes[number] = self._started(number)
-        wait_until_ready(self._processes[number])
 
     def close(self) -> list[int]:
         """Stop both as a service manager does; return their statuses."""
@@ -68,7 +65,10 @@ class Servers:
     def _started(self, number: int) -> subprocess.Popen[str]:
         command = [*tool("mapserver"), "serve", "--store", str(self.folders[number])]
         command += ["--http", "127.0.0.1:0", "--zenoh", self._endpoints[number]]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        lines = [process.stdout.readline().strip() for _ in range(3)]
+        assert lines[2] == "ready", lines
+        return process
 
     def _balance(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -91,11 +91,6 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
             writer.write(data)
             await writer.drain()
     writer.close()
-
-
-def wait_until_ready(process: subprocess.Popen[str]) -> None:
-    lines = [process.stdout.readline().strip() for _ in range(3)]
-    assert lines[2] == "ready", lines
 
 
 class Robot(threading.Thread):

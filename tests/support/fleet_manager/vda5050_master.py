@@ -4,7 +4,6 @@ import json
 import shutil
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -15,6 +14,7 @@ import jsonschema_rs
 import pytest
 
 from fleetmap.bus.endpoints import handshake_fault, with_free_port
+from support.waiting import eventually
 
 SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050"
 PATIENCE_S = 60.0
@@ -47,10 +47,7 @@ def mosquitto(folder: Path) -> Iterator[int]:
 
 
 def until(found: Callable[[], bool], words: object = "", patience_s: float = PATIENCE_S) -> None:
-    deadline = time.monotonic() + patience_s
-    while not found():
-        assert time.monotonic() < deadline, words() if callable(words) else words
-        time.sleep(0.02)
+    assert eventually(found, patience_s), words() if callable(words) else words
 
 
 class Master:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.geometry import Array
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, png_image
 from fleetmap.recordings.recording import WrappedFrames
@@ -85,6 +86,16 @@ def with_imu(recording: Recording, imu: ImuSamples) -> Recording:
     """With another run's IMU, moved to begin when its own begins."""
     moved_ns = int(recording.imu.stamps_ns[0]) - int(imu.stamps_ns[0])
     return replace(recording, imu=replace(imu, stamps_ns=imu.stamps_ns + moved_ns))
+
+
+def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Callable[[Recording], Recording]:
+    """Samples multiplied by matrices (3, 3) or numbers."""
+    by_accel, by_gyro = (np.eye(3) * by if np.ndim(by) < 2 else by for by in (accel, gyro))
+
+    def multiplied(of: ImuSamples) -> ImuSamples:
+        return ImuSamples(of.stamps_ns, of.gyro_radps @ by_gyro.T, of.accel_mps2 @ by_accel.T)
+
+    return lambda recording: replace(recording, imu=multiplied(recording.imu))
 
 
 def without_imu(recording: Recording) -> Recording:

@@ -65,12 +65,9 @@ def bytes_of_image(change: Callable[[bytes], bytes]) -> Spoil:
 flipped = bytes_of_image(lambda data: data[:500] + bytes([data[500] ^ 0x55]) + data[501:])
 
 
-def no_rotation(rows: list[str]) -> None:
-    rows[2] = ",".join([rows[2].split(",")[0], *["0"] * 16])
-
-
-def far_away(rows: list[str]) -> None:
-    rows[2] = ",".join([rows[2].split(",")[0], "1e308", "-1e308", "0", "1", *["0"] * 12])
+def moved(numbers: str) -> Spoil:
+    """Other numbers in a row of the truth."""
+    return edit(TRUTH, lambda rows: [*rows[:2], f"{rows[2].partition(',')[0]},{numbers}", *rows[3:]])
 
 
 def larger_lens(folder: Path) -> None:
@@ -135,8 +132,8 @@ def test_what_cannot_be_read_is_named(euroc: Path, spoil: Spoil, says: str) -> N
         (edit(CAMERA, lambda rows: [rows[at] for at in (0, 1, 3, 2, 4)]), 3, "cam0: stamps not increasing"),
         (edit(TABLE, lambda rows: [*rows[:-1], rows[-1][:-60]]), 4, "data.csv: unreadable lines: 1 of"),
         (imu(gyro=np.where(np.arange(len(GYRO))[:, None] == 7, np.nan, GYRO)), 4, "imu: impossible values: 1 of"),
-        (edit(TRUTH, no_rotation), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion"),
-        (edit(TRUTH, far_away), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion or a near position"),
+        (moved("0" + 15 * ",0"), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion"),
+        (moved("1e308,-1e308,0,1" + 12 * ",0"), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion or a near position"),
     ],
 )  # fmt: skip
 def test_what_is_lost_is_counted(euroc: Path, spoil: Spoil, frames: int, says: str) -> None:

@@ -24,16 +24,6 @@ SAMPLE = make_sample(12)
 YEAR_NS = 365 * 86_400 * 10**9
 
 
-def with_last_pair_late(folder: Path, by_ns: int) -> Path:
-    """The sample as a EuRoC folder whose last stamps of both cameras are too late."""
-    write_euroc(folder, SAMPLE)
-    for number in (0, 1):
-        file = folder / f"mav0/cam{number}/data.csv"
-        *rows, last = file.read_text().splitlines()
-        file.write_text("\n".join([*rows, f"{int(SAMPLE.stamps_ns[-1]) + by_ns},{last.partition(',')[2]}"]))
-    return folder
-
-
 def messages(topic: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> list[mcap_samples.Message]:
     """The sample as ROS messages, the header's stamps of one topic multiplied by a factor."""
     monkeypatch.setattr(mcap_samples, "SAMPLE", SAMPLE)
@@ -109,7 +99,13 @@ def test_work_is_bounded_whatever_stamps_say(tmp_path: Path) -> None:
     for stamps_ns in (np.array([0, 1, 170 * YEAR_NS]), np.array([-100 * YEAR_NS, 0, 100 * YEAR_NS])):
         assert len(planned(stamps_ns, SegmentSettings(seconds=60.0))) <= 3
         assert forward_only(stamps_ns, "imu", ReadLog()).all()
-    recording = open_recording(with_last_pair_late(tmp_path / "r", 170 * YEAR_NS))
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    for number in (0, 1):
+        file = folder / f"mav0/cam{number}/data.csv"
+        *rows, last = file.read_text().splitlines()
+        late_ns = int(SAMPLE.stamps_ns[-1]) + 170 * YEAR_NS
+        file.write_text("\n".join([*rows, f"{late_ns},{last.partition(',')[2]}"]))
+    recording = open_recording(folder)
     assert len(recording) == len(SAMPLE.stamps_ns) - 1
     assert any(issue.what == "cam0: stamps far apart" for issue in recording.issues)
 

@@ -39,19 +39,15 @@ def reference(splats: Splats, parameters: Array, map_from_cam: Array) -> Array:
     return picture
 
 
-def some_splats(seed: int) -> tuple[Splats, Array]:
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(12, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.column_stack([rng.uniform(1, 3, 12), rng.uniform(-0.5, 0.5, 12), rng.uniform(-0.4, 0.4, 12)])
-    sigmas_m, greys, opacities = rng.uniform(0.1, 0.4, 12), rng.uniform(0, 255, 12), rng.uniform(0.2, 0.9, 12)
-    splats = Splats(points.astype(np.float32), normals.astype(np.float32), sigmas_m, greys, opacities)
-    return splats, se3(so3_exp(rng.normal(0, 0.1, 3)) @ OPTICAL, rng.normal(0, 0.1, 3))
-
-
 def test_pictures_and_derivatives_as_of_the_reference() -> None:
     for seed in range(3):
-        splats, place = some_splats(seed)
+        rng = np.random.default_rng(seed)
+        normals = rng.normal(size=(12, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        points = np.column_stack([rng.uniform(1, 3, 12), rng.uniform(-0.5, 0.5, 12), rng.uniform(-0.4, 0.4, 12)])
+        sigmas_m, greys, opacities = rng.uniform(0.1, 0.4, 12), rng.uniform(0, 255, 12), rng.uniform(0.2, 0.9, 12)
+        splats = Splats(points.astype(np.float32), normals.astype(np.float32), sigmas_m, greys, opacities)
+        place = se3(so3_exp(rng.normal(0, 0.1, 3)) @ OPTICAL, rng.normal(0, 0.1, 3))
         parameters = parameters_of(splats)
         drawn = draw(splats, parameters, CAMERA, place)
         np.testing.assert_allclose(drawn.picture, reference(splats, parameters, place), atol=1e-6)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import solver_of
@@ -76,15 +75,10 @@ def test_reduced_system(inertial: bool, body_from_others: Array) -> None:
     problem = _problem(inertial=inertial, body_from_others=body_from_others)
     matrix, rhs = _eliminated(problem)
     lower, ours_rhs = solver_of(problem, NO_ROBUSTNESS).reduced(0.0)
-    whole, free = np.tril(lower) + np.tril(lower, -1).T, _free(problem)
-    ours = whole[np.ix_(free, free)]
+    moves = np.ones((len(problem.fixed), 15 if inertial else 6), np.bool_)
+    moves[problem.fixed, :6] = False
+    free = moves[moves.any(axis=1)].ravel()  # keyframes of which nothing moves are not in the reduced system
+    ours = (np.tril(lower) + np.tril(lower, -1).T)[np.ix_(free, free)]
     scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
     np.testing.assert_allclose(ours / scale, matrix / scale, atol=2e-5)
     np.testing.assert_allclose(ours_rhs[free], rhs, atol=2e-5 * np.abs(rhs).max())
-
-
-def _free(problem: BundleProblem) -> NDArray[np.bool_]:
-    """(U,) which unknowns of the reduced system move: keyframes without any are not in it."""
-    moves = np.ones((len(problem.fixed), 6 if problem.inertial is None else 15), np.bool_)
-    moves[problem.fixed, :6] = False
-    return moves[moves.any(axis=1)].ravel()

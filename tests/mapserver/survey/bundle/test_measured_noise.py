@@ -76,7 +76,11 @@ def test_disparities_that_are_too_large_at_depth_edges_hardly_change_the_scale()
         marks = given.state.landmarks
         is_edge = rng.random(len(marks.obs_pixels)) < 0.25
         pixels = marks.obs_pixels.copy()
-        exact = _exact_pixels(_at_truth(given, marks.obs_sigma_px))
+        problem = _at_truth(given, marks.obs_sigma_px)
+        cam_from_map = se3_inverse(problem.map_from_cams)[problem.obs_keyframe, problem.obs_camera]
+        points = problem.points_map[problem.obs_landmark]
+        seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3]
+        exact = problem.rig.camera.pixel_from_point(seen)
         pixels = exact + (pixels - exact) / 3.0  # noise of a third of what is claimed
         pixels[is_edge, 2] -= np.abs(rng.normal(0, 0.5, is_edge.sum()))
         claimed = np.tile([0.35, 0.2], (len(pixels), 1))
@@ -88,10 +92,3 @@ def test_disparities_that_are_too_large_at_depth_edges_hardly_change_the_scale()
         after.append(_scale_error(given, bundle_rounds(given.state, SETTINGS, rounds=2, final=True).map_from_body))
     assert np.mean(before) > 0.001
     assert np.mean(after) < 0.5 * np.mean(before)
-
-
-def _exact_pixels(problem: BundleProblem) -> Array:
-    cam_from_map = se3_inverse(problem.map_from_cams)[problem.obs_keyframe, problem.obs_camera]
-    points = problem.points_map[problem.obs_landmark]
-    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3]
-    return problem.rig.camera.pixel_from_point(seen)

@@ -80,16 +80,6 @@ def estimate(k: int, status: OdometryStatus, *, scale_known: bool) -> OdometryEs
     return OdometryEstimate(k, k, place, np.eye(6), status, inertial=scale_known, scale_known=scale_known)
 
 
-def guess_of(marks: str, *, scale_known: bool) -> OdometryPass:
-    """i initialising, t tracking, d degraded, T tracking in metres, D degraded in metres."""
-    kinds = {"i": OdometryStatus.INITIALISING, "t": OdometryStatus.TRACKING, "d": OdometryStatus.DEGRADED}
-    estimates = [estimate(k, kinds[m.lower()], scale_known=m.isupper()) for k, m in enumerate(marks)]
-    return OdometryPass(
-        estimates, np.array([e.odom_from_body for e in estimates]), np.array([e.cov_rot_trans for e in estimates]),
-        np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), [], scale_known, scale_known,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("marks", "scale_known", "kept"),
     [
@@ -100,5 +90,12 @@ def guess_of(marks: str, *, scale_known: bool) -> OdometryPass:
     ],
 )
 def test_the_longest_part_with_one_scale_is_kept(marks: str, scale_known: bool, kept: range | list[int]) -> None:
-    part = longest_run(guess_of(marks, scale_known=scale_known), np.eye(4))
+    """i initialising, t tracking, d degraded, T tracking in metres, D degraded in metres."""
+    kinds = {"i": OdometryStatus.INITIALISING, "t": OdometryStatus.TRACKING, "d": OdometryStatus.DEGRADED}
+    estimates = [estimate(k, kinds[m.lower()], scale_known=m.isupper()) for k, m in enumerate(marks)]
+    guess = OdometryPass(
+        estimates, np.array([e.odom_from_body for e in estimates]), np.array([e.cov_rot_trans for e in estimates]),
+        np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), [], scale_known, scale_known,
+    )  # fmt: skip
+    part = longest_run(guess, np.eye(4))
     assert np.flatnonzero(part.tracked).tolist() == list(kept)

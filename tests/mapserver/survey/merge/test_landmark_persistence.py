@@ -8,14 +8,15 @@ import pytest
 
 from mapserver.survey.merge.landmark_persistence import LandmarkCounts, count_landmarks, faded, missed_since, shifts
 from mapserver.survey.settings import SessionSettings, SurveySettings
-from mapserver.survey.survey_map import History
+from mapserver.survey.survey_map import History, SurveyMap
 from support.worlds.session_scene import session_scene
 
 
-def history(expected: int, seen: int, missed: int, count: int) -> History:
-    """The same past for all landmarks of six keyframes."""
-    numbers = (np.full(count, n, np.uint32) for n in (expected, seen, missed))
-    return History(np.arange(6, dtype=np.uint32), np.ones(6, bool), *numbers, 6, count)
+def base(expected: int, seen: int, missed: int) -> SurveyMap:
+    """Six keyframes, and landmarks that all have the same past."""
+    numbers = (np.full(300, n, np.uint32) for n in (expected, seen, missed))
+    history = History(np.arange(6, dtype=np.uint32), np.ones(6, bool), *numbers, 6, 300)
+    return session_scene(1, landmarks=300, history=history).base
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -38,37 +39,33 @@ def test_noise_moves_nothing_and_what_moved_is_found(seed: int) -> None:
 
 def test_a_landmark_fades_when_its_misses_are_too_unlikely() -> None:
     """Of a landmark that was seen in every second look, n misses happen with probability (1 - 0.7 * 0.5)^n."""
-    count = 300
-    scene = session_scene(1, landmarks=count, history=history(1000, 500, 0, count))
-    n = len(scene.base.points_map)
+    known = base(1000, 500, 0)
+    n = len(known.points_map)
     limit = int(np.ceil(np.log(0.001) / np.log(1 - 0.7 * 0.5)))
     settings = SurveySettings(sessions=SessionSettings(fade_probability=0.001, look_weight=0.7))
     for misses, gone in ((1, False), (limit - 1, False), (limit + 1, True)):
         counts = LandmarkCounts(np.full(n, misses), np.zeros(n, np.int64))
-        assert (faded(scene.base, counts, settings) == gone).all(), misses
+        assert (faded(known, counts, settings) == gone).all(), misses
 
 
 def test_one_sighting_brings_a_landmark_back() -> None:
-    count = 300
-    scene = session_scene(1, landmarks=count, history=history(40, 20, 14, count))
-    n = len(scene.base.points_map)
+    known = base(40, 20, 14)
+    n = len(known.points_map)
     seen = LandmarkCounts(np.full(n, 10), np.r_[np.ones(n // 2, np.int64), np.zeros(n - n // 2, np.int64)])
-    missed = missed_since(scene.base, seen)
+    missed = missed_since(known, seen)
     assert (missed[: n // 2] == 0).all()
     assert (missed[n // 2 :] == 24).all()
-    gone = faded(scene.base, seen, SurveySettings())
+    gone = faded(known, seen, SurveySettings())
     assert not gone[: n // 2].any()
     assert gone[n // 2 :].all()
 
 
 def test_a_landmark_that_is_hardly_ever_seen_may_be_missed_longer() -> None:
-    count = 300
-    often = session_scene(1, landmarks=count, history=history(100, 60, 0, count))
-    rarely = session_scene(1, landmarks=count, history=history(100, 6, 0, count))
-    n = len(often.base.points_map)
+    often, rarely = base(100, 60, 0), base(100, 6, 0)
+    n = len(often.points_map)
     counts = LandmarkCounts(np.full(n, 16), np.zeros(n, np.int64))
-    assert faded(often.base, counts, SurveySettings()).all()
-    assert not faded(rarely.base, counts, SurveySettings()).any()
+    assert faded(often, counts, SurveySettings()).all()
+    assert not faded(rarely, counts, SurveySettings()).any()
 
 
 def test_two_features_of_a_picture_see_a_landmark_once() -> None:
