@@ -124,7 +124,9 @@ class Fleet:
     def __init__(
         self, store: MapStore, *, settings: IngestSettings = _USUAL, clock_ns: Callable[[], int] = time.time_ns
     ) -> None:
-        self._store, self._clock_ns, self._lock = store, clock_ns, threading.Lock()
+        self._store = store
+        self._clock_ns = clock_ns
+        self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
         self.prune = self._ingest.prune
         self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)

@@ -83,8 +83,10 @@ class Ingest:
     """Counts in memory until `flush` writes to the disk; failures are written at once. Methods may be called from any thread."""
 
     def __init__(self, store: MapStore, settings: IngestSettings) -> None:
-        self._store, self._settings = store, settings
-        self._lock, self._flushing = threading.Lock(), threading.Lock()
+        self._store = store
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._flushing = threading.Lock()
         self._batch = FleetBatch()
         self._grids: dict[tuple[str, int], _Grid | None] = {}
         self._canaries: dict[str, CanaryRow] = {}

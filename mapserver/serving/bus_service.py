@@ -55,8 +55,12 @@ class BusService:
         """guard: of the enrolled robots, if only those may connect; None: no restriction. take_drive: receives a part of a robot's drive
         through a requested area; None: this server has no inbox for them, and asks robots for none.
         """
-        self._store, self._fleet, self._bus, self._count = store, fleet, bus, count
-        self._guard, self._take_drive = guard, take_drive
+        self._take_drive = take_drive
+        self._guard = guard
+        self._store = store
+        self._fleet = fleet
+        self._bus = bus
+        self._count = count
         self._refusals = LogLimit(_log)
         self._rates = {what: RateLimit(burst, per_s, store.now_ns) for what, (burst, per_s) in REPORT_RATES.items()}
         self._rates["renew"] = RateLimit(*RENEWAL_RATE, store.now_ns)
