@@ -8,10 +8,16 @@ from fleetmap.encoding import to_json, to_plain
 from fleetmap.files import appearing_file
 from mapserver.store import FailureDetail, FailureFilter, MapStore
 
+_PAGE = 200
+
 
 def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[FailureDetail]:
     """Return failures with their context, in the order of their times."""
-    for _, number in sorted((row.happened_ns, row.number) for row in store.fleet.failures(wanted)):
+    rows, before = [], None
+    while page := store.fleet.failures(wanted, before=before, limit=_PAGE):
+        rows += [(row.happened_ns, row.number) for row in page]
+        before = page[-1].number
+    for _, number in sorted(rows):
         yield store.fleet.failure(number)
 
 
