@@ -42,11 +42,7 @@ constexpr size_t kLooks = 24;         // and largest number of probes
 constexpr double kHidden = 1e-4;  // share of the light at which a pixel is full
 
 // One of so many pixels in a row or column is merged, so that a surface at a metre has voxels of kEdgeM: finer ones cost as the square.
-int stride_px(double focal) {
-  int stride = 2;
-  while (stride < 4 && kEdgeM * focal / kFootprintShare >= stride + 0.5) ++stride;
-  return stride;
-}
+int stride_px(double focal) { return kEdgeM * focal / kFootprintShare < 2.5 ? 2 : 4; }
 
 inline double edge_of(int level) { return kEdgeM * double(1 << level); }
 
@@ -247,15 +243,16 @@ Look look(Vec3 point_map, int level, double per_m, const Depths& view) {
   found.point_cam = cam_from_map * point_map;
   const double depth = found.point_cam[2];
   if (!(depth > kMinRangeM && depth < kMaxRangeM)) return found;
-  found.u = lens.focal * found.point_cam[0] / depth + lens.cx, found.v = lens.focal * found.point_cam[1] / depth + lens.cy;
-  const ptrdiff_t column = whole(std::floor(found.u / step_px + 0.5)), row = whole(std::floor(found.v / step_px + 0.5));
+  const double per_depth = lens.focal / depth, per_step = 1.0 / step_px;
+  found.u = found.point_cam[0] * per_depth + lens.cx, found.v = found.point_cam[1] * per_depth + lens.cy;
+  const double column = found.u * per_step + 0.5, row = found.v * per_step + 0.5;
   const Picture<const float> nearest = nearest_px;
-  if (column < 0 || column >= nearest.width || row < 0 || row >= nearest.height || !(nearest.row(row)[column] > 0.0f)) return found;
-  const double shown = lens.focal_baseline / nearest.row(row)[column];
-  const double clear = clear_sigmas * shown * shown / lens.focal_baseline * sigma_px + clear_m;
-  found.weight = float(1 << 2 * std::max(0, level - level_at(depth, per_m)));
+  if (!(column >= 0.0 && column < double(nearest.width) && row >= 0.0 && row < double(nearest.height))) return found;
+  const float px = nearest.row(ptrdiff_t(row))[ptrdiff_t(column)];
+  if (!(px > 0.0f)) return found;
+  const double shown = lens.focal_baseline / px, clear = clear_sigmas * shown * sigma_px / px + clear_m;
   if (depth < shown - clear)
-    found.mark = kSeenThrough;
+    found.mark = kSeenThrough, found.weight = float(1 << 2 * std::max(0, level - level_at(depth, per_m)));
   else if (depth < shown + clear)
     found.mark = kSeen;
   return found;

@@ -544,6 +544,15 @@ def share_in_view(
 def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
     """(V,) root of each node after the links first-second, except links that would put a keyframe twice into a group."""
 
+# --- dense stereo: every DENSE_STEP_PX-th pixel each way, by DENSE_BLOCK_PX around it ---
+DENSE_STEP_PX: int
+DENSE_BLOCK_PX: int
+DENSE_FRACTIONS: int
+DENSE_MOST_PX: int
+
+def match_densely(left: _Grey, right: _Grey, farthest_px: float) -> NDArray[np.int16]:
+    """Disparities of the left picture in DENSE_FRACTIONS of a pixel, 0 unknown; farthest_px: 0 to DENSE_MOST_PX."""
+
 # --- grid: windows and tiles of cells, with 8 voxels each (see grid.cpp) ---
 GRID_RAY_STRIDE_PX: int
 GRID_CLEAR_SIGMAS: float
@@ -557,7 +566,7 @@ def cast_view(
     camera: _Reals,
     was_free: _Grey,
 ) -> tuple[_Counts, _Grey, _Grey]:
-    """Pixels (R, C, 8) in voxels, voxels that rays pass or would pass, and codes (R, C, 2) of the lowest and the highest point."""
+    """Samples (R, C, 8) in voxels, voxels that rays pass or would pass, and codes (R, C, 2) of the lowest and the highest point."""
 
 def add_view(
     points: _Counts,
@@ -569,8 +578,8 @@ def add_view(
     passes: _Grey,
     hidden: _Grey,
     tile_heights: _Grey,
-) -> None:
-    """Add a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column)."""
+) -> bool:
+    """Add a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column); False if it is empty there."""
 
 def inertial_residual(
     map_from_body: _Reals, motions: _Reals, gravity: _Reals, increments: _Reals

@@ -67,10 +67,10 @@ class SessionViews:
             was_free = was_free & np.roll(was_free, 1, axis) & np.roll(was_free, -1, axis)
         was_free[[0, -1]], was_free[:, [0, -1]] = 0, 0
         window = core.cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free)
-        for (x, y), _, in_window in parts:
-            if any(column[in_window].any() for column in window[:2]):
-                row, column = y * TILE_CELLS - int(corner[1]), x * TILE_CELLS - int(corner[0])
-                core.add_view(*window, row, column, *self._tile(x, y))
+        for (x, y), *_ in parts:
+            row, column, counts = y * TILE_CELLS - int(corner[1]), x * TILE_CELLS - int(corner[0]), self._tile(x, y)
+            if core.add_view(*window, row, column, *counts):
+                self.tiles[x, y] = counts
 
     def add_path(self, cameras_map: Array, floor_m: float) -> None:
         """Add the path of the camera (K, 2 or more): its carrier occupied it, as wide as a person and as high as the camera."""
@@ -86,14 +86,15 @@ class SessionViews:
         levels = int(np.clip(np.ceil((floor_m - FLOOR_M) / SLICE_M), 0, SLICES))
         for tile in np.unique(cells // TILE_CELLS, axis=0):
             mine = cells[(cells // TILE_CELLS == tile).all(axis=1)] - tile * TILE_CELLS
-            passes = self._tile(*tile.tolist())[1]
+            x, y = tile.tolist()
+            passes = self.tiles.setdefault((x, y), self._tile(x, y))[1]
             passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], FREE)
 
     def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts, Counts]:
-        if (x, y) not in self.tiles:
-            hits, passes, hidden = (np.zeros((TILE_CELLS, TILE_CELLS, SLICES), np.uint8) for _ in range(3))
-            self.tiles[x, y] = hits, passes, hidden, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
-        return self.tiles[x, y]
+        if (x, y) in self.tiles:
+            return self.tiles[x, y]
+        hits, passes, hidden = (np.zeros((TILE_CELLS, TILE_CELLS, SLICES), np.uint8) for _ in range(3))
+        return hits, passes, hidden, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
 
 
 _Part = tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]

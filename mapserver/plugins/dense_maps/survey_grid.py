@@ -13,7 +13,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.version_grid import Counts, Tiles
 from mapserver.drafting.draft_evidence import MappedSession
-from mapserver.plugins.dense_maps.dense_stereo import dense_disparity, floor_distance_m, nearest_around
+from mapserver.plugins.dense_maps.dense_stereo import STEP_PX, dense_disparity, floor_distance_m, nearest_around
 from mapserver.plugins.dense_maps.site_grid import FREE, REACH_PX, SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.stages import Survey
@@ -28,7 +28,7 @@ _NO_DEPTH = "one camera measures no depth; that needs a stereo pair or a depth c
 
 @dataclass(frozen=True)
 class DepthView:
-    """A keyframe with its disparities (H, W), their standard deviation, and its pose (4, 4)."""
+    """A keyframe with its disparities as of `dense_disparity`, their standard deviation, and its pose (4, 4)."""
 
     keyframe: Keyframe
     disparity_px: NDArray[np.float32]
@@ -37,7 +37,7 @@ class DepthView:
 
     @cached_property
     def nearest_px(self) -> NDArray[np.float32]:
-        """(H, W) disparities as of `nearest_around`, as far around each pixel as its depth may belong to."""
+        """Disparities as of `nearest_around`, as far around each pixel as its depth may belong to."""
         return nearest_around(self.disparity_px, REACH_PX)
 
 
@@ -66,7 +66,7 @@ def adding_keyframes(session: MappedSession) -> list[Keyframe]:
 def depth_view(session: MappedSession, settings: StereoSettings, keyframe: Keyframe) -> DepthView:
     """Return a keyframe of a session, densely matched."""
     survey, camera = session.survey, session.survey.state.rig.camera
-    columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
+    columns = np.arange(0, camera.width_px, STEP_PX, dtype=np.float64)[:, None]
     yaw_px = (survey.stereo_yaws[0].correction_px * disparity_shift(camera, columns)).astype(np.float32)
     disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
     map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.rig.body_from_cam[0]

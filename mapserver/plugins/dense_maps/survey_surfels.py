@@ -16,6 +16,7 @@ from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
 from mapserver.drafting.draft_evidence import MappedSession
+from mapserver.plugins.dense_maps.dense_stereo import STEP_PX
 from mapserver.plugins.dense_maps.exposure import Exposure, Sample, estimate_exposure, squared_tangent
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT, OCCUPIED
 from mapserver.plugins.dense_maps.surfel_map import (
@@ -75,10 +76,10 @@ class SurfelGrower:
 
     def add(self, view: DepthView) -> None:
         disparity_px, stride = view.disparity_px, core.surfel_stride_px(self._camera.focal_px)
-        step, kept = slice(None, None, stride), slice(None, None, _KEPT_STEP_PX)
+        kept = slice(None, None, _KEPT_STEP_PX // STEP_PX)
         nearest = np.where(disparity_px[kept, kept] > 0, view.nearest_px[kept, kept], np.float32(0.0))
         smooth = np.asarray(cv2.blur(view.keyframe.frame.left, (stride + 1, stride + 1)), np.uint8)
-        sparse = np.ascontiguousarray(disparity_px[step, step])
+        sparse = np.ascontiguousarray(disparity_px[:: stride // STEP_PX, :: stride // STEP_PX])
         arrays: list[Any] = self._images.keep([sparse, nearest, smooth])
         map_from_cam = np.ascontiguousarray(view.map_from_cam)
         look = _Look(arrays[0], arrays[1], arrays[2], view.sigma_px, map_from_cam, se3_inverse(map_from_cam))
@@ -258,10 +259,13 @@ def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[
             continue
         held, counts = np.unique(_keys(other.points_map[finer], level), return_counts=True)
         held = held[counts >= (_MIN_FINER if finer_by else 1)]
+        if not len(held):
+            continue
         edge_m = EDGE_M * (1 << level)
         for step in (-1.0, 0.0, 1.0):
             moved = surfels.points_map[mine] + np.float32(step * edge_m) * surfels.normals[mine]
-            known[mine] |= np.isin(_keys(moved, level), held)
+            keys = _keys(moved, level)
+            known[mine] |= held.take(np.searchsorted(held, keys), mode="clip") == keys
     return known
 
 

@@ -10,13 +10,13 @@ from fleetmap import core
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M, FLOOR_M, SLICE_M, SLICES, Counts, occupancy
-from mapserver.plugins.dense_maps.dense_stereo import floor_distance_m, nearest_around
+from mapserver.plugins.dense_maps.dense_stereo import STEP_PX, floor_distance_m, nearest_around
 from mapserver.plugins.dense_maps.site_grid import REACH_PX, SessionViews, height_map, updated
 
 CAMERA = StereoCamera(60.0, 31.5, 23.5, 0.12, 64, 48)
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SIGMA_PX, HEIGHT_M = 0.05, 0.9
-PASSED, HIDDEN, MAX_HIT_SIGMA_M, RAY_STRIDE = 1, 2, 0.08, 4  # as grid.h has them
+PASSED, HIDDEN, MAX_HIT_SIGMA_M, RAY_STRIDE = 1, 2, 0.08, 2  # as grid.cpp has them
 
 
 def brute_force(
@@ -28,10 +28,11 @@ def brute_force(
     for v, u in np.argwhere(disparity > 0):
         depth = CAMERA.focal_px * CAMERA.baseline_m / float(disparity[v, u])
         sigma = depth**2 / (CAMERA.focal_px * CAMERA.baseline_m) * SIGMA_PX
-        ray = turn @ np.array([(u - CAMERA.cx_px) / CAMERA.focal_px, (v - CAMERA.cy_px) / CAMERA.focal_px, 1.0]) * depth
+        off_px = np.array([STEP_PX * u - CAMERA.cx_px, STEP_PX * v - CAMERA.cy_px])
+        ray = turn @ np.append(off_px / CAMERA.focal_px, 1.0) * depth
         ray[:2] /= CELL_M
         end = place + ray
-        if end[2] < -0.15 or v % 2 or u % 2:
+        if end[2] < -0.15:
             continue
         is_news = False
         if sigma <= MAX_HIT_SIGMA_M and end[2] >= FLOOR_M:
@@ -85,7 +86,7 @@ def wall_views(
 ) -> SessionViews:
     """A camera that drives along x towards a wall 1.2 m high across its way, over a floor that a hall ends at x = 9 m."""
     views, lens = SessionViews(before or {}), StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
-    v, u = np.mgrid[0:480, 0:640]
+    v, u = np.mgrid[0:480:STEP_PX, 0:640:STEP_PX]
     across, down = (u - lens.cx_px) / lens.focal_px, (v - lens.cy_px) / lens.focal_px
     for x in places_x_m:
         with np.errstate(divide="ignore"):
@@ -144,11 +145,11 @@ def test_nothing_is_free_beside_the_edge_of_a_thing() -> None:
     """Depths of the wall behind among those of a post, as a matcher gives them at its edge."""
     lens = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
     px = lens.focal_px * lens.baseline_m
-    disparity = np.full((480, 640), px / 5.0, np.float32)
-    disparity[:, 300:340] = px / 2.0
+    disparity = np.full((240, 320), px / 5.0, np.float32)
+    disparity[:, 150:170] = px / 2.0
     views = SessionViews()
     for _ in range(8):
-        disparity[:, 296:304] = px / 5.0  # an edge that lies 4 px within the post
+        disparity[:, 148:152] = px / 5.0  # an edge that lies 4 px within the post
         view = disparity, nearest_around(disparity, REACH_PX), 0.3
         views.add(view, lens, se3(OPTICAL, np.array([0.0, 0.0, HEIGHT_M])), HEIGHT_M)
     grid = occupancy(updated(views), 0.8)
@@ -179,7 +180,7 @@ def test_something_that_moves_leaves_no_trace() -> None:
 
 def test_the_floor_is_found_or_it_is_said_that_there_is_none() -> None:
     lens = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
-    v, _ = np.mgrid[0:480, 0:640]
+    v, _ = np.mgrid[0:480:STEP_PX, 0:640:STEP_PX]
     down = (v - lens.cy_px) / lens.focal_px
 
     def view(height_m: float) -> tuple[NDArray[np.float32], Array]:
