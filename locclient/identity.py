@@ -208,7 +208,7 @@ class MapAddress:
             )
         if server is None or not has_tls(server):
             identity = None
-            check_reach(server, insecure=bool(given.insecure))
+            check_reach(server, insecure=bool(given.insecure), sign=f"{sign}server = ")
         elif identity is None:
             raise UsageError(f"this robot has no identity in {folder}, which {server} asks for; {_ENROL}")
         if given.version is not None and given.store is None:
@@ -221,8 +221,14 @@ class MapAddress:
 
 
 def check_reach(endpoint: str | None, *, insecure: bool, sign: str = "") -> None:
-    """Raise UsageError for an endpoint without TLS on another machine, unless `insecure`. sign: before it in the message."""
-    if endpoint is None or has_tls(check_endpoint(endpoint)) or is_loopback(endpoint) or insecure:
+    """Raise UsageError for a malformed endpoint, and unless `insecure` for one on another machine without TLS. sign: begins the message."""
+    if endpoint is None:
+        return
+    try:
+        check_endpoint(endpoint)
+    except UsageError as error:
+        raise UsageError(f"{sign}{error}") from error
+    if has_tls(endpoint) or is_loopback(endpoint) or insecure:
         return
     raise UsageError(
         f"{sign}{endpoint} is on another machine and without TLS: others on the network can read and answer. Use tls/HOST:PORT, or "

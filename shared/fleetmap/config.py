@@ -5,7 +5,11 @@ field of a section is an internal constant: it has its reason beside it in the c
 """
 
 import math
+import re
+import tomllib
 from collections.abc import Iterator, Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -64,9 +68,17 @@ def load_toml(path: Path, kind: type[T]) -> T:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
     # tomllib's own errors for invalid UTF-8, impossible dates and deep nesting
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise UsageError(
-            f"configuration file {path}: {str(error)[:500]}; docs/settings.md lists the settings"
-        ) from error
+        fault = f"{str(error)[:500]}{_given_there(data, str(error))}"
+        raise UsageError(f"configuration file {path}: {fault}; docs/settings.md lists the settings") from error
+
+
+def _given_there(data: bytes, fault: str) -> str:
+    """Return words with the value that the file gives where msgspec finds a fault; none for a whole section."""
+    place = re.search(r" at `\$\.([\w.]+)`$", fault)
+    if place is None:
+        return ""
+    value: Any = reduce(getitem, place[1].split("."), tomllib.loads(data.decode()))
+    return "" if isinstance(value, dict) else f", which is {value!r:.100}"
 
 
 def settings_in(section: Section, name: str = "") -> Iterator[Setting]:

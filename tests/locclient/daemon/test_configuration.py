@@ -43,7 +43,9 @@ def test_a_robot_that_cannot_run_says_so_at_once(config: Path, capsys: Said) -> 
         ('robot = "r1"', "", 2, "[run] robot is missing"),
         ('robot = "r1"', 'robot = "r 1"', 2, "r 1"),
         ("speed = 0", "speed = 0\nspede = 1", 2, "spede"),
+        ('robot = "r1"', 'robot = "r1"\nframe_queue = 0', 2, "`$.run.frame_queue`, which is 0;"),
         ("/walk", "/nowhere", 3, "does not exist"),
+        ("[source]", '[output]\nendpoint = "local"\n[source]', 2, "[output] endpoint = endpoint 'local'"),
         ("[source]", "[run.trial]\ncontradicting_looks = 9\n[source]", 2, "kidnap_fixes"),
         ("[source]", '[output]\nformat = "xml"\nendpoint = "tcp/127.0.0.1:1"\n[source]', 2, "xml"),
     ):
