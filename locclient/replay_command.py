@@ -196,10 +196,10 @@ def _run(
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     use = None if playback.use is None else named_sensor_set(playback.use)
-    how = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
+    options = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = plain_console(stderr=True)
     with ExitStack() as stack:
-        recording = reduced(stack.enter_context(open_recording(path, how)), use)
+        recording = reduced(stack.enter_context(open_recording(path, options)), use)
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         export: RunExport | None = None if opening is None else stack.enter_context(opening)
         maps = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
@@ -207,8 +207,8 @@ def _run(
             for issue in recording.issues:
                 console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
-            told = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
-            result = play(source, maps, ReplayOptions(*told, partial(image_priors_of, settings), address.robot), prior)
+            how = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
+            result = play(source, maps, ReplayOptions(*how, partial(image_priors_of, settings), address.robot), prior)
         report, more = result.report, dict[str, object]()
         if playback.starts:
             numbers, loaded = spread_starts(source, playback.starts), load_map(maps)[0]

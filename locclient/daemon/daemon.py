@@ -184,8 +184,8 @@ def _server(
 ) -> ServerSync:
     """Return the exchange with the map server, and with the links that the file asks for."""
     client = map_client(bus, cache, address)
-    retry_s, identity = config.run.trial.retry_s, address.identity
-    server = ServerSync(client, outbox, retry_s=retry_s, identity=identity, put_prior=intake.put_prior)
+    retry_s = config.run.trial.retry_s
+    server = ServerSync(client, outbox, retry_s=retry_s, identity=address.identity, put_prior=intake.put_prior)
     server.is_alone = address.server is None
     lost_radius_m = config.localizer.track.lost_radius_m
     robot = LinkedRobot(client, config.run.insecure, lost_radius_m, server.fetched.append, intake.put_prior)

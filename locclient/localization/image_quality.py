@@ -62,7 +62,8 @@ class ImageQualityMonitor:
         pairs = zip(thinned, self._last, strict=False)
         self._frozen = [contrast > 1.0 and own == last for (own, _, contrast, *_), last in pairs]
         self._last[: len(pixels)] = pixels
-        (_, mean, contrast, bright_share, variance), settings = thinned[0], self._settings
+        _, mean, contrast, bright_share, variance = thinned[0]
+        settings = self._settings
         typical = median(self._sharpness) if self._sharpness else variance
         if contrast < settings.dark_contrast:
             cause = Cause.DARK if mean < 128.0 else Cause.GLARE

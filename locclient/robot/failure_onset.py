@@ -132,7 +132,9 @@ class OnsetRecorder:
         """Return evidence for the cause of a failure detected with this estimate."""
         found = self.open.get(kind)
         belief = self._belief if found is None else found.belief
-        elsewhere, wrong_by_m, had_fix = estimate.hypotheses, estimate.moved_m, False
+        elsewhere = estimate.hypotheses
+        wrong_by_m = estimate.moved_m
+        had_fix = False
         if belief is not None:
             had_fix = began_ns - belief.fix_ns <= _RECENT_FIX_NS
             limit_m = max(ERROR_LIMIT_M, radius_95_m(belief.cov_rot_trans))
@@ -158,7 +160,8 @@ class OnsetRecorder:
     def _onset(self, stamp_ns: int, frame: RectifiedFrame, odom_from_body: Array, view: int) -> Onset:
         before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]
         chosen = {picture[0]: picture[1] for picture in before if picture is not None}
-        belief, left = self._belief and self._belief.carried_on(odom_from_body), _left(frame, view)
+        belief = self._belief and self._belief.carried_on(odom_from_body)
+        left = _left(frame, view)
         return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, view)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:

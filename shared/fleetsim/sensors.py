@@ -140,8 +140,9 @@ def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibratio
 
 
 _DEPTH_BASE_M, _DEPTH_SIGMA_PX, _DEPTH_RANGE_M = 0.05, 0.08, (0.3, 10.0)
-# Wheel odometry: rate, scale errors' rms per robot, noise per sample; sideways slip is in the motion already
-_WHEEL_HZ, _SPEED_SCALE, _YAW_SCALE, _WHEEL_NOISE_MPS, _WHEEL_NOISE_RADPS = 50.0, 0.005, 0.01, 0.01, 0.005
+_WHEEL_HZ = 50.0
+_SPEED_SCALE, _YAW_SCALE = 0.005, 0.01  # rms over robots; sideways slip is in the motion already
+_WHEEL_NOISE_MPS, _WHEEL_NOISE_RADPS = 0.01, 0.005  # per sample
 START_NS = 1_700_000_000_000_000_000  # the sensor clock at the start of every recording
 
 

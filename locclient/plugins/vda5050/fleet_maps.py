@@ -142,7 +142,8 @@ class FleetMaps:
         """Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
         origins.check()
         self._client, self._cache, self._site, self._origins = client, client.cache, client.site, origins
-        self._folder, active = client.cache.folder / "incoming", client.cache.active(client.site)
+        self._folder = client.cache.folder / "incoming"
+        active = client.cache.active(client.site)
         try:
             with disk_errors(f"{self._folder} cannot be used", "choose another cache"):
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -45,7 +45,8 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
         possible = ", ".join(REDUCTIONS[recording.sensor_set])
         fault = f"is {recording.sensor_set}, it cannot be used as {use}"
         raise RecordingError(f"{recording.path} {fault}; use it as {possible}")
-    calibration, imu, is_single = recording.calibration, recording.imu, use.startswith("mono")
+    calibration, imu = recording.calibration, recording.imu
+    is_single = use.startswith("mono")
     if not use.endswith("-inertial"):
         calibration, imu = replace(calibration, imu=None), ImuSamples.empty()
     if is_single:

@@ -221,8 +221,8 @@ def open_written(path: Path, opener: Callable[[], Container], options: OpenOptio
         found = "; ".join(filter(None, (f"there is {there}", log.told())))
         roles = dict[str, list[Stream]]()
         for role, types in _TYPES.items():
-            name, of_type = getattr(options.topics, role), [s for s in streams if s.channel.type_name in types]
-            named = {stream.channel.topic: stream for stream in of_type}
+            name = getattr(options.topics, role)
+            named = {stream.channel.topic: stream for stream in streams if stream.channel.type_name in types}
             if stream := next((named[sent] for sent in transports(name, role) if sent in named), None):
                 roles[role] = [stream]
             elif role == "left" or (name and name != getattr(Topics(), role)):
