@@ -46,7 +46,8 @@ class PositionBound(NamedTuple):
         if not estimate.is_at_home:  # another site's map, which says nothing of this one's tiles
             return PositionBound()
         if estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}:
-            odometry, position_map_m = estimate.odometry, estimate.map_from_body[:3, 3]
+            odometry = estimate.odometry
+            position_map_m = estimate.map_from_body[:3, 3]
             turn = estimate.map_from_body[:3, :3] @ odometry.odom_from_body[:3, :3].T
             return PositionBound(position_map_m, turn @ odometry.velocity_odom_mps, stamp_ns=estimate.stamp_ns)
         if self.position_map_m is None:

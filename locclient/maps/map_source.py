@@ -79,7 +79,8 @@ class MapSource(ABC):
 
         After a request without an answer only tiles at hand are read, so that a robot without a network does not wait for each of them.
         """
-        tiles, refused, away = dict[Cell, Tile](), dict[Cell, str](), None
+        tiles, refused = dict[Cell, Tile](), dict[Cell, str]()
+        away: UnreachableError | None = None
         asked = None if cells is None else set(cells)
         for entry in manifest.tiles:
             cell = (entry.x, entry.y)

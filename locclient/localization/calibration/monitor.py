@@ -107,11 +107,8 @@ def with_calibration(estimate: Estimate, rig: MountedRig, last_fix_ns: int | Non
 
 
 def _widened(estimate: Estimate, rig: MountedRig) -> Estimate:
-    covariance, map_from_body, bias_cam = (
-        estimate.cov_rot_trans,
-        estimate.map_from_body,
-        estimate.calibration.cov_bias_cam,
-    )
+    covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
+    bias_cam = estimate.calibration.cov_bias_cam
     if covariance is None or map_from_body is None or bias_cam is None:
         return estimate
     map_from_cam = map_from_body @ rig.mounted[0].body_from_cam

@@ -64,7 +64,8 @@ def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
 
 def _raw_camera(file: Path, number: str, image: Path) -> CameraCalibration:
     """A camera, by the size of an image: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
-    rows, size_px = _rows(file), check_image(layout.read_image(image))
+    rows = _rows(file)
+    size_px = check_image(layout.read_image(image))
     if np.array_equal(_numbers(file, rows, f"S_rect_{number}", 2), size_px):
         return _projected(file, rows, f"P_rect_{number}", size_px)
     matrix, turn = (_numbers(file, rows, f"{name}_{number}", 9).reshape(3, 3) for name in "KR")
@@ -111,7 +112,8 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         stamps_of_number = np.round(seconds * 1e9).astype(np.int64)
     left, right = (_images(path / name, stamps_of_number, log) for name in (left_name, right_name))
     if (calibration := calibration_of_options(options, log)) is None:
-        file, size_px = path / "calib.txt", check_image(layout.read_image(left.sources[0]))
+        file = path / "calib.txt"
+        size_px = check_image(layout.read_image(left.sources[0]))
         names = (f"P{row}" for row in (left_row, right_row))
         calibration = RigCalibration(tuple(_projected(file, _rows(file), name, size_px) for name in names))
         log.files.append(file)
