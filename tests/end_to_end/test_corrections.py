@@ -145,7 +145,7 @@ def test_a_screen_that_is_never_used_misleads_nobody(tmp_path: Path) -> None:
         run(locclient_app, "replay", robot, "--site", "lab", "--store", store, "--report", report)
         found[version] = json.loads(report.read_text())
         draw(store, {"never-use": (-1.05, 1.25)})
-    assert (found[1]["silent_failures"], found[2]["silent_failures"]) == (1, 0)
+    assert (found[1]["position_failures"], found[2]["position_failures"]) == (1, 0)
     assert found[1]["error_m"]["median"] == pytest.approx(0.3, abs=0.02)
     assert found[2]["error_m"]["max"] < 0.03
     assert found[2]["localised_share"] == 1.0

@@ -45,7 +45,8 @@ def test_the_filters_are_there(unit: Path) -> None:
         subprocess.run(words, capture_output=True, text=True, check=False)
         for words in (program, filtered(unit, program))
     )
-    assert (free.stdout.splitlines()[:-1], bound.stdout.splitlines()) == ([], ["97", "1", "-1"]), bound.stderr
+    netlink = [] if "AF_NETLINK" in unit.read_text("utf-8") else ["97"]  # by which ROS lists interfaces
+    assert (free.stdout.splitlines()[:-1], bound.stdout.splitlines()) == ([], [*netlink, "1", "-1"]), bound.stderr
 
 
 @pytest.mark.timeout(600)
