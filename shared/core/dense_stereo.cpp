@@ -34,10 +34,9 @@ inline void store(Lanes from, uint16_t* to) { std::memcpy(to, &from, sizeof from
 inline Lanes lesser(Lanes a, Lanes b) { return a < b ? a : b; }
 // The least, in all places.
 inline Lanes spread_least(Lanes of) {
-  of = lesser(of, __builtin_shufflevector(of, of, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7));
-  of = lesser(of, __builtin_shufflevector(of, of, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11));
-  of = lesser(of, __builtin_shufflevector(of, of, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13));
-  return lesser(of, __builtin_shufflevector(of, of, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14));
+  uint16_t least = of[0];
+  for (ptrdiff_t k = 1; k < kLanes; ++k) least = std::min<uint16_t>(least, of[k]);
+  return Lanes{} + least;
 }
 
 // Costs by disparity of the paths that end at each pixel of a row, with kLanes of kFar before and after each; the least of each.
