@@ -226,10 +226,7 @@ class MapQuery:
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
     def _near(
-        self,
-        features: FrameFeatures,
-        hypothesis: PoseHypothesis,
-        earlier: Sequence[EarlierFrame] = (),
+        self, features: FrameFeatures, hypothesis: PoseHypothesis, earlier: Sequence[EarlierFrame] = ()
     ) -> Fix | None:
         """Return the fix near a hypothesis at the frame of the query, by that frame and earlier ones."""
         relocalizer = self._on(hypothesis.now.floor)

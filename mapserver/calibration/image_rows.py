@@ -33,12 +33,7 @@ _STEP_PX = 0.1  # of the numerical derivative of raw by rectified pixels
 # Columns of the distortion of both lenses, and of their difference; those that move what the left lens measures
 _BOTH = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
 _DIFFERENCE = slice(_BOTH.stop, _BOTH.stop + DISTORTION)
-_LEFT_LENS = {
-    INDEX[P.FOCAL],
-    INDEX[P.PRINCIPAL_X],
-    INDEX[P.PRINCIPAL_Y],
-    *range(_BOTH.start, _BOTH.stop),
-}
+_LEFT_LENS = {INDEX[P.FOCAL], INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y], *range(_BOTH.start, _BOTH.stop)}
 # Step sizes of the numerical derivatives of the measurements: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)

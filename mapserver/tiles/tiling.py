@@ -205,9 +205,7 @@ def _views(survey: SurveyMap, sightings: Sequence[Sighting]) -> tuple[NDArray[np
         np.repeat(np.arange(len(map_from_keyframe), len(map_from_cam)), [len(each.landmarks) for each in sightings]),
     ])  # fmt: skip
     points_cam = np.einsum(
-        "mij,mj->mi",
-        se3_inverse(map_from_cam)[view, :3, :3],
-        survey.points_map[landmark] - map_from_cam[view, :3, 3],
+        "mij,mj->mi", se3_inverse(map_from_cam)[view, :3, :3], survey.points_map[landmark] - map_from_cam[view, :3, 3]
     )
     column = np.clip(pixels[:, 0] / camera.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.int64)
     row = np.clip(pixels[:, 1] / camera.height_px * _ROWS, 0, _ROWS - 1).astype(np.int64)

@@ -209,10 +209,7 @@ def camera_votes(
     """
 
 def mark_shared(
-    one: tuple[_Reals, _Descriptors, _Flags],
-    other: tuple[_Reals, _Descriptors, _Flags],
-    reach_m: float,
-    max_bits: int,
+    one: tuple[_Reals, _Descriptors, _Flags], other: tuple[_Reals, _Descriptors, _Flags], reach_m: float, max_bits: int
 ) -> None:
     """Set flags (N,) of landmarks at points_odom (N, 3) that have a look-alike of the other place within reach_m."""
 

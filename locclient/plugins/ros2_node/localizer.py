@@ -300,11 +300,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
 
     def _send_diagnosis(self, is_silent: bool) -> None:
         state = _WARN, "no frame yet"
-        values = {
-            "lifecycle": self._lifecycle,
-            "map": self._map_words,
-            "refused_initial_pose": self._refused or None,
-        }
+        values = {"lifecycle": self._lifecycle, "map": self._map_words, "refused_initial_pose": self._refused or None}
         if self._last is not None:
             estimate, published = self._last
             status, cause, cov = estimate.status.value, estimate.cause.value, estimate.cov_rot_trans

@@ -60,12 +60,7 @@ SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version built with th
 SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply; replaced if it exists.")]
 
 
-def splats(
-    version: SurfelVersion,
-    file: SplatFile,
-    site: SiteName,
-    store: StoreFolder,
-) -> None:
+def splats(version: SurfelVersion, file: SplatFile, site: SiteName, store: StoreFolder) -> None:
     """Write the surfels of a version as 3D Gaussians, in the frame of the map, for viewers of Gaussian splats."""
     check_output("FILE", file, ".ply")
     from mapserver.plugins.dense_maps.splats import Splats, splat_ply

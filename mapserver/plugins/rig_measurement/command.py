@@ -32,8 +32,7 @@ def calibrate(
     guess: Annotated[
         str | None,
         typer.Option(
-            metavar="WxH:M",
-            help="Without a calibration: raw image size and metres between the cameras, 752x480:0.11.",
+            metavar="WxH:M", help="Without a calibration: raw image size and metres between the cameras, 752x480:0.11."
         ),
     ] = None,
     config: ConfigFile = None,

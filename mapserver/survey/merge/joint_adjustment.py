@@ -17,13 +17,7 @@ from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
-from mapserver.survey.bundle.problem import (
-    OBSERVED,
-    BundleProblem,
-    InertialTerms,
-    continued,
-    measured_sigmas,
-)
+from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, InertialTerms, continued, measured_sigmas
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.merge import Change

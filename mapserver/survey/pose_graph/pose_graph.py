@@ -158,10 +158,7 @@ def _factor(edge: PoseEdge) -> gtsam.NoiseModelFactor:
 
 
 def loop_weights(
-    certain: gtsam.NonlinearFactorGraph,
-    loops: list[gtsam.NoiseModelFactor],
-    start: gtsam.Values,
-    bound: float,
+    certain: gtsam.NonlinearFactorGraph, loops: list[gtsam.NoiseModelFactor], start: gtsam.Values, bound: float
 ) -> tuple[Array, gtsam.Values]:
     """Return the weight (len(loops),) of each loop, 1 accepted and 0 not, and the resulting poses of the keyframes.
 

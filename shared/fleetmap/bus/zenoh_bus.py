@@ -60,12 +60,7 @@ class Bus:
     """
 
     def __init__(
-        self,
-        endpoint: str,
-        *,
-        is_server: bool = False,
-        tls: TlsFiles | None = None,
-        access: Access | None = None,
+        self, endpoint: str, *, is_server: bool = False, tls: TlsFiles | None = None, access: Access | None = None
     ) -> None:
         """Create a closed bus: see `open`. tls: mutual TLS; access: rules of a server with mutual TLS.
 

@@ -61,7 +61,7 @@ _ADVICE = {
     (".mcap.zst", ".mcap.zstd", ".bag.zst"): "`zstd -d {path}` unpacks it",
 }
 RECORDING_FORMATS = {
-    "mcap": RecordingFormat("an .mcap file of fleetmap's", reader.recognises, reader.open_mcap, (".mcap",)),
+    "mcap": RecordingFormat("an .mcap file of fleetmap's", reader.recognises, reader.open_mcap, (".mcap",))
 }
 _installed = cache(plugins)
 
