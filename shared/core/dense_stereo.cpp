@@ -137,7 +137,8 @@ std::vector<int16_t> match(GreyImage left, GreyImage right, ptrdiff_t range) {
     for (ptrdiff_t i = columns - 1; i >= 0; --i) {
       uint16_t* const total = totals.data() + i * range;
       extend(aside, i & 1, costs.data() + i * range, aside, ~i & 1, total);
-      if (std::accumulate(textures.begin() + i, textures.begin() + i + kTexture, 0) < kMinTexture) continue;
+      const bool sees_all = i * kStepPx >= range;  // at the left edge the right picture does not show what is near
+      if (!sees_all || std::accumulate(textures.begin() + i, textures.begin() + i + kTexture, 0) < kMinTexture) continue;
       Lanes best = ~Lanes{}, nearest = best;
       for (ptrdiff_t d = 0; d < range; d += kLanes) best = lesser(best, loaded(total + d));
       best = spread_least(best);
