@@ -119,10 +119,10 @@ Peak search(const StereoPair& pair, ptrdiff_t x, ptrdiff_t y, ptrdiff_t first, p
   return peak;
 }
 
-// Numbers of a row of samples: whole registers, of which those beyond the wanted ones are finite and mean nothing.
+// Numbers of a row of samples: whole registers, of which those beyond the wanted ones mean nothing.
 constexpr int stride_of(int half, int rim) { return (2 * (half + rim) + 4) / 4 * 4; }
 constexpr int kMostStride = stride_of(kMostStereoHalf, 1);
-using Samples = double[kMostSide * kMostStride + 4];
+using Samples = double[kMostSide * kMostStride];
 
 // As many pixels as fill whole registers.
 void widen(const uint8_t* __restrict pixels, double* __restrict to, int count) {
@@ -135,10 +135,10 @@ void mix(const Bilinear<double>& at, const double* upper, const double* lower, d
 
 // Brightness between pixels, whole steps apart: 2 half + 1 rows around (x, y), each of which goes on by `rim` pixels on both sides. All,
 // and a row below, must lie inside.
-void sample(GreyImage image, double x, double y, int half, int rim, int stride, Samples& samples) {
+void sample(GreyImage image, double x, double y, int half, int rim, Samples& samples) {
   const ptrdiff_t column = ptrdiff_t(x), row = ptrdiff_t(y);
   const Bilinear<double> at(x - double(column), y - double(row));
-  const int columns = 2 * (half + rim) + 1;
+  const int columns = 2 * (half + rim) + 1, stride = stride_of(half, rim);
   double grey[2][kMostStride + 8] = {}, *to = samples;
   const auto line = [&](ptrdiff_t v) { return grey[v & 1]; };
   const auto take = [&](ptrdiff_t v) { widen(image.row(v) + column - half - rim, line(v), columns + 1); };
@@ -147,65 +147,50 @@ void sample(GreyImage image, double x, double y, int half, int rim, int stride, 
     take(v + 1);
     mix(at, line(v), line(v + 1), to, stride);
   }
-  std::fill_n(to, 4, 0.0);
 }
 
-using Four [[gnu::vector_size(4 * sizeof(double))]] = double;
-
-inline Four four(const double* from) {
-  Four out;
-  std::memcpy(&out, from, sizeof out);
-  return out;
-}
-
-inline double folded(Four sums) { return (sums[0] + sums[1]) + (sums[2] + sums[3]); }
-
-// Gauss-Newton from a disparity; unknown unless it converges. Sums are of every fourth column, then of these four.
+// Gauss-Newton from a disparity; unknown unless it converges.
 Disparity refine(const StereoPair& pair, double x, double y, double disparity, int half) {
   const double height = double(pair.right.height), width = double(pair.right.width);
-  const int side = 2 * half + 1, area = side * side, stride = stride_of(half, 1);
+  const int side = 2 * half + 1, area = side * side, stride_l = stride_of(half, 0), stride = stride_of(half, 1);
   if (x - half < 1 || y - half < 1 || x + half + 2 >= width || y + half + 2 >= height) return {};
-  double inside[kMostStride] = {};  // 1 in the columns of the window, else 0
-  std::fill_n(inside, side, 1.0);
-  const auto for_each = [&](const auto& visit) {
-    for (int v = 0; v < side; ++v)
-      for (int u = 0; u < side; u += 4) visit(v * stride + u, four(inside + u));
-  };
   Samples l, r;
-  sample(pair.left, x, y, half, 0, stride, l);
-  Four sums_l = {}, energies = {};
-  for_each([&](int at, Four kept) { sums_l += kept * four(l + at); });
-  const double mean_l = folded(sums_l) / area;
-  for_each([&](int at, Four kept) {
-    const Four off = kept * (four(l + at) - mean_l);
-    energies += off * off;
-    std::memcpy(l + at, &off, sizeof off);
+  sample(pair.left, x, y, half, 0, l);
+  const auto for_each_left = [&](const auto& visit) {
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) visit(l[v * stride_l + u]);
+  };
+  double mean_l = 0.0, energy = 0.0;
+  for_each_left([&](double value) { mean_l += value; });
+  mean_l /= area;
+  for_each_left([&](double& value) {
+    value -= mean_l;
+    energy += value * value;
   });
-  const double energy = folded(energies);
   if (energy < area) return {};
   for (int iteration = 0; iteration < kMostIterations; ++iteration) {
     const double x_right = x - disparity;
     if (x_right - half < 2 || x_right + half + 3 >= width) return {};
-    sample(pair.right, x_right, y, half, 1, stride, r);
-    Four sums_r = {}, sums_rr = {}, sums_lr = {};
-    for_each([&](int at, Four kept) {
-      const Four value = kept * four(r + at + 1);
-      sums_r += value;
-      sums_rr += value * value;
-      sums_lr += four(l + at) * value;
-    });
-    const double sum_r = folded(sums_r), mean_r = sum_r / area;
-    const double gain = folded(sums_lr) / std::max(folded(sums_rr) - sum_r * mean_r, 1e-9);
+    sample(pair.right, x_right, y, half, 1, r);
+    double sum_r = 0.0, sum_rr = 0.0, sum_lr = 0.0;
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) {
+        const double value = r[v * stride + u + 1];
+        sum_r += value;
+        sum_rr += value * value;
+        sum_lr += l[v * stride_l + u] * value;
+      }
+    const double mean_r = sum_r / area, gain = sum_lr / std::max(sum_rr - sum_r * mean_r, 1e-9);
     if (gain < 0.4 || gain > 2.5) return {};
-    Four sums_jj = {}, sums_je = {}, sums_ee = {};
-    for_each([&](int at, Four kept) {
-      const Four j = kept * (0.5 * gain * (four(r + at + 2) - four(r + at)));
-      const Four e = four(l + at) - kept * (gain * (four(r + at + 1) - mean_r));
-      sums_jj += j * j;
-      sums_je += j * e;
-      sums_ee += e * e;
-    });
-    const double sum_jj = folded(sums_jj), sum_je = folded(sums_je), sum_ee = folded(sums_ee);
+    double sum_jj = 0.0, sum_je = 0.0, sum_ee = 0.0;
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) {
+        const double* at = r + v * stride + u + 1;
+        const double j = 0.5 * gain * (at[1] - at[-1]), e = l[v * stride_l + u] - gain * (at[0] - mean_r);
+        sum_jj += j * j;
+        sum_je += j * e;
+        sum_ee += e * e;
+      }
     if (sum_jj < 10.0 * area) return {};
     const double step = sum_je / sum_jj;
     disparity -= step;
