@@ -1,7 +1,7 @@
 """Information of one fix on the mounting of the cameras, by gravity, driving direction and the ground. Pure."""
 
 from bisect import bisect_left
-from cmath import phase, rect
+from cmath import phase
 from collections import deque
 from collections.abc import Sequence
 from operator import itemgetter
@@ -47,7 +47,7 @@ class WheelTravel:
             last_ns, place_m, yaw_rad = self._placed[-1] if self._placed else (sample.stamp_ns, 0j, 0.0)
             elapsed_s = (sample.stamp_ns - last_ns) * 1e-9
             turn_rad = sample.yaw_rate_radps * elapsed_s
-            way_m = elapsed_s * complex(*sample.velocity_base_mps[:2]) * rect(1.0, yaw_rad + 0.5 * turn_rad)
+            way_m = elapsed_s * complex(*sample.velocity_base_mps[:2]) * np.exp(1j * (yaw_rad + 0.5 * turn_rad))
             self._placed.append((sample.stamp_ns, place_m + way_m, yaw_rad + turn_rad))
 
     def at(self, stamp_ns: int) -> Array:
@@ -79,7 +79,7 @@ def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
     """
     before_from_now = se3_inverse(before.map_from_base) @ now.map_from_base
     turn_rad = float(so3_log(before_from_now[:3, :3])[2])
-    wheels_m = complex(*(now.by_wheels - before.by_wheels)[:2]) * rect(1.0, -before.by_wheels[2])
+    wheels_m = complex(*(now.by_wheels - before.by_wheels)[:2]) * np.exp(-1j * before.by_wheels[2])
     missing_rad = turn_rad - float(now.by_wheels[2] - before.by_wheels[2])
     step_m = before_from_now[:2, 3]
     length_m = float(np.linalg.norm(step_m))

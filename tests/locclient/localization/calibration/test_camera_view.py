@@ -139,6 +139,7 @@ def test_a_step_that_shows_no_direction_says_nothing() -> None:
     assert mounting.heading(base_at(0, 0, 0), base_at(1, 0, 0.5, (1, 0, 0.5))) is None  # a turn
     assert mounting.heading(base_at(0, 0, 0), base_at(1, 0, 0)) is None  # carried
     assert mounting.heading(base_at(0, 0, 0), base_at(1, 0, 0, (np.nan, np.nan, np.nan))) is None  # no wheels then
+    assert mounting.heading(base_at(0, 0, 0, (0, 0, np.inf)), base_at(1, 0, 0, (1, 0, np.inf))) is None  # absurd ones
 
 
 def test_wheels_sum_up_along_their_turns() -> None:
@@ -153,6 +154,8 @@ def test_wheels_sum_up_along_their_turns() -> None:
     around = WheelTravel()
     around.handle(quarter)
     assert np.allclose(around.at(1_000_000_000), [1.0, 1.0, 0.5 * np.pi], atol=1e-3)
+    around.handle([WheelSample(k * 10**10, np.full(3, 1e308), 1e308, 0.01, 0.01) for k in (1, 2, 3)])
+    assert not np.isfinite(around.at(3 * 10**10)).any(), "absurd speeds end nothing"
 
 
 def landmarks(rng: np.random.Generator, on_floor: int) -> Array:
