@@ -28,7 +28,7 @@ from mapserver.survey.survey_inputs import SurveyTools, TrackedFrame
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 20
-_MATCHED_EVERY = 4  # of those, while the matches of the pairs are good beyond doubt
+_MATCHED_EVERY = 4  # of those, where the matches of so few pairs are good
 _LONGEST_STEP_S = 0.7e-9 * LONGEST_STEP_NS  # of an IMU whose steps vary
 _STEP_S = 0.045  # between two frames for a speed: one step at 20 Hz
 TURN_FRAMES = 120
