@@ -190,10 +190,10 @@ def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served
     expect(page.get_by_role("list", name="Cause")).to_contain_text("<b>bold</b>")
     expect(listed(page).filter(has_text="suspected")).to_contain_text("<b>bold</b>")
     assert page.locator("main b").count() == 0, "words of robots are words"
-    page.get_by_role("list", name="Cause").get_by_role("link", name="dark").click()
+    page.get_by_role("list", name="Cause").get_by_role("link", name="dark", exact=True).click()
     expect(page).to_have_url(re.compile("cause=dark"))
     expect(listed(page)).to_have_count(1)
-    page.get_by_role("list", name="Cause").get_by_role("link", name="dark").click()
+    page.get_by_role("list", name="Cause").get_by_role("link", name="dark", exact=True).click()
     expect(listed(page)).to_have_count(2)
     page.get_by_role("group", name="Failures over time").get_by_role("link").first.click()
     expect(page).to_have_url(re.compile("since=.*until="))
