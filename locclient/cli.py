@@ -25,7 +25,9 @@ def enrol(
     from locclient.identity import RobotIdentity, identity_folder
 
     with disk_errors(f"{bundle} cannot be read", "check the path", UsageError), bundle.open("rb") as file:
-        data = file.read(_MAX_BUNDLE_BYTES)  # a longer file is no bundle, and the beginning of one neither
+        data = file.read(_MAX_BUNDLE_BYTES + 1)
+    if len(data) > _MAX_BUNDLE_BYTES:
+        raise UsageError(f"{bundle} has more than {_MAX_BUNDLE_BYTES} bytes and is not an enrolment bundle")
     made = RobotIdentity.enrol(identity_folder(identity), data)
     about = made.certificate()
     typer.echo(f"enrolled as {made.who.robot} of site {made.who.site} at {made.who.endpoint}")

@@ -1,5 +1,6 @@
 """Settings of the estimates that a robot publishes to its own programs, and the interface through which they reach them."""
 
+from abc import ABC, abstractmethod
 from typing import Annotated
 
 import msgspec
@@ -35,20 +36,28 @@ class OutputSection(Section, frozen=True):
     transform_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=60)] = 0.0
 
 
-class Publisher:
-    """Sends estimates; this one to nobody. An estimate that cannot be sent at once is dropped: the next one replaces it."""
+class Publisher(ABC):
+    """Sends estimates. An estimate that cannot be sent at once is dropped: the next one replaces it."""
 
     grid_height_m: float | None = None
     """Robot height in metres for the version's occupancy grid; None if no grid is published."""
 
+    @abstractmethod
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """Send this estimate."""
 
-    def alive(self, is_silent: bool) -> None:
+    def alive(self, is_silent: bool) -> None:  # noqa: B027
         """Publish a heartbeat, called once a second; is_silent: no frames are received."""
 
-    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:  # noqa: B027
         """Publish the grid of the version that runs now, or the reason `why` there is none; thread-safe."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Undeclare all publishers."""
+
+
+class NoPublisher(Publisher):
+    """Sends estimates to nobody."""
+
+    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
+        return

@@ -23,9 +23,18 @@ if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
 
 _FIRST = (build, versions, inspect, diff, serve, verify, gc, attach, retention, export, import_, convert, doctor, align)
-_GROUPS = {"areas": AREAS, "building": BUILDING, "fleet": FLEET, "incidents": INCIDENTS, "robots": ROBOTS}
-_LAST = {"operators": OPERATORS, "audit": audit, "trust": TRUST, **plugins("mapserver.commands")}
-_COMMANDS: Commands = {**{command.__name__.rstrip("_"): command for command in _FIRST}, **_GROUPS, **_LAST}
+_COMMANDS: Commands = {
+    **{command.__name__.rstrip("_"): command for command in _FIRST},
+    "areas": AREAS,
+    "building": BUILDING,
+    "fleet": FLEET,
+    "incidents": INCIDENTS,
+    "robots": ROBOTS,
+    "operators": OPERATORS,
+    "audit": audit,
+    "trust": TRUST,
+    **plugins("mapserver.commands"),
+}
 COMMANDS = with_operations(_COMMANDS)
 
 

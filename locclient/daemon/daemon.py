@@ -31,7 +31,7 @@ from locclient.maps.map_client import cache_folder, map_client, open_bus
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource, address_of
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.outputs import Publisher
+from locclient.outputs import NoPublisher, Publisher
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
 
@@ -154,7 +154,7 @@ def _opened_publisher(
     if config.output.endpoint is not None:
         bus = stack.enter_context(Bus(config.output.endpoint).open())
     elif output.needs_bus and (bus is None or address.server is None):
-        return Publisher()
+        return NoPublisher()
     publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)
     stack.callback(publisher.close)
     return publisher
