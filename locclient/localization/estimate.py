@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker
-from locclient.localization.settings import TrackSettings
 
 
 class Hypothesis(NamedTuple):
@@ -107,13 +105,13 @@ def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> E
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     known = None if prior is None else prior.hypothesis
     if ranking and (is_open or known is None or not tracker.was_tracking):
-        return estimate if is_open else _with_pose(estimate, ranking[0].now, settings)
+        return estimate if is_open else _with_pose(estimate, ranking[0].now)
     if known is None or estimate.map_version is None:
         return estimate
     # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
     if radius_95_m(known.now.cov_rot_trans) <= settings.lost_radius_m:
         status = Status.DEGRADED
-    return _with_pose(estimate, known.now, settings, status=status, cause=_cause(estimate, has_failed=True))
+    return _with_pose(estimate, known.now, status=status, cause=_cause(estimate, has_failed=True))
 
 
 def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
@@ -142,22 +140,14 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
     if status is not Status.TRACKING and told:  # the robot may be at either
         hypotheses = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, cause=cause, hypotheses=hypotheses)
-    return _with_pose(estimate, confirmed.now, settings, status=status, cause=cause)
+    return _with_pose(estimate, confirmed.now, status=status, cause=cause)
 
 
-@lru_cache(maxsize=1)
-def map_cov(settings: TrackSettings) -> Array:
-    """Return the covariance (6, 6) of the map itself at a place, rotation first."""
-    return np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
-
-
-def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings, **changes: Any) -> Estimate:
-    """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out, beside other changes.
-
-    The estimate has no pose if pose or covariance contain NaN.
-    """
+def _with_pose(estimate: Estimate, place: Place, **changes: Any) -> Estimate:
+    """Add the pose, beside other changes. The estimate has no pose if pose or covariance contain NaN."""
     if not (np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any()):
-        changes |= place._replace(cov_rot_trans=place.cov_rot_trans + map_cov(settings))._asdict()
+        of_place = place._asdict()
+        changes |= {name: of_place[name] for name in ("map_from_body", "cov_rot_trans", "floor")}
     return replace(estimate, **changes)
 
 

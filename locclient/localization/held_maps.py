@@ -3,19 +3,24 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import Floor
+from fleetmap.mapformat.map_errors import UNKNOWN_ERRORS, MapErrors
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Relocalizer
+from locclient.localization.place import Place
 
 
 class HeldMap(NamedTuple):
-    """A version of one floor's map: a relocalizer for each camera of the rig. lookalikes, alias_step_m: see `Localizer.handle_version`."""
+    """A version of one floor's map: a relocalizer for each camera of the rig. The others: see `Localizer.handle_version`."""
 
     version: int
     relocalizers: tuple[Relocalizer, ...]
     lookalikes: LookAlikes | None = None
     alias_step_m: float = ALIAS_STEP_M
+    errors: MapErrors = UNKNOWN_ERRORS
 
 
 class HeldMaps:
@@ -41,6 +46,15 @@ class HeldMaps:
     def version_on(self, floor: str) -> int | None:
         held = self.by_floor.get(floor)
         return None if held is None else held.version
+
+    def map_sigmas(self, place: Place) -> Array:
+        """Return the sigmas (6,) of the map's own error at a place, rotation first, in map axes."""
+        held = self.by_floor.get(place.floor)
+        return (UNKNOWN_ERRORS if held is None else held.errors).sigmas(place.position_m)
+
+    def map_cov(self, place: Place) -> Array:
+        """Return the covariance (6, 6) of the map's own error at a place."""
+        return np.diag(self.map_sigmas(place) ** 2)
 
     @property
     def lookalikes(self) -> LookAlikes | None:

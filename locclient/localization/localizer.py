@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from fleetmap.mapformat.building import Floor
+from fleetmap.mapformat.map_errors import UNKNOWN_ERRORS, MapErrors
 from fleetmap.messages import Cause
 from fleetmap.odometry.estimate import is_away
 from fleetmap.relocalization.map_view import LookAlikes, MapView
@@ -11,7 +12,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
-from locclient.localization.estimate import Estimate, assemble, map_cov
+from locclient.localization.estimate import Estimate, assemble
 from locclient.localization.held_maps import HeldMap, HeldMaps
 from locclient.localization.map_query import MapQuery
 from locclient.localization.perception import Percept, Perception
@@ -68,16 +69,23 @@ class Localizer:
         self._tracker.forget()
 
     def handle_version(
-        self, version: int, view: MapView, lookalikes: LookAlikes | None, alias_step_m: float, site: str = ""
+        self,
+        version: int,
+        view: MapView,
+        lookalikes: LookAlikes | None,
+        alias_step_m: float,
+        site: str = "",
+        errors: MapErrors = UNKNOWN_ERRORS,
     ) -> None:
         """Use this part of a version from now on; cancel a running map query.
 
         lookalikes: similarity of unmapped places to the map; None if not measured. alias_step_m: smallest distance at which its
-        places look alike. site: of another one's map in the building, see `handle_building`; empty for the robot's own.
+        places look alike. site: of another one's map in the building, see `handle_building`; empty for the robot's own. errors: of the
+        version's own places.
         """
         settings, mounted = self._settings.relocalizer, self._rig.mounted
         relocalizers = tuple(Relocalizer(view, camera, settings, site) for camera, _ in mounted)
-        self.maps.by_floor[site] = HeldMap(version, relocalizers, lookalikes, alias_step_m)
+        self.maps.by_floor[site] = HeldMap(version, relocalizers, lookalikes, alias_step_m, errors)
         self._query.begin_anew()
         self._calibration.give_up()
 
@@ -132,8 +140,7 @@ class Localizer:
             finished = self._query.finished
             if finished is not None and finished.fix is not None:
                 place = tracker.place_by(finished.fix)
-                of_fix = place.map_from_body, place.cov_rot_trans + map_cov(self._settings.track)
-                self.perception.odometry.handle_fix(finished.odometry, *of_fix, is_confirmed=finished.is_confirmed)
+                self.perception.odometry.handle_fix(finished.odometry, *place[:2], is_confirmed=finished.is_confirmed)
             if self._query.finished is not None and self._query.view == 0:
                 self._calibration.add(self._query.finished)
             percept.calibration = self._calibration.state

@@ -232,8 +232,8 @@ class MapQuery:
         relocalizer = self._on(hypothesis.now.floor)
         if relocalizer is None:
             return None
-        map_from_cam, covariance, _ = hypothesis.then.of_point(self._tracker.body_from_cam)
-        return relocalizer.near(features, map_from_cam, covariance, earlier)
+        place = hypothesis.then.of_point(self._tracker.body_from_cam)
+        return relocalizer.near(features, place.map_from_body, place.cov_rot_trans, earlier)
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
         return (hypothesis.then.map_from_body @ self._tracker.body_from_cam)[:3, :3]

@@ -2,6 +2,10 @@
 
 Covariances are rotation first, in map axes, about the body. A perturbation (6,) rotates a pose from the left and shifts its position,
 independently of each other: SO(3) x R^3. Sources: Barfoot and Furgale 2014 for compounding, Hertzberg et al. 2013 for boxplus and boxminus.
+
+The map has an error of its own at each place, which all fixes there share, so that it does not average out. A place keeps how much of its
+own error is the map's, and nobody estimates it: a consider filter. The map's error changes with the way: first-order Gauss-Markov.
+Sources: Schmidt 1966; DuToit et al. 2017 and Geneva et al. 2019 (landmarks of a prior map).
 """
 
 from typing import NamedTuple
@@ -9,7 +13,24 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov, turn_both
+from fleetmap.geometry import (
+    Array,
+    length,
+    rotation_angle_rad,
+    se3,
+    se3_inverse,
+    skew,
+    so3_exp,
+    so3_log,
+    transport_cov,
+    turn_both,
+)
+
+_MAP_LENGTH_M = (
+    5.0  # way after which a map's error has forgotten all but 1/e of itself: measured, 3 to 8 make no difference
+)
+_SCENE_M = 3.0  # distance of what is seen: a turn shows other parts of the map, as a way does
+_NO_PART = np.zeros((6, 6))
 
 
 def boxminus(measured: Array, predicted: Array) -> Array:
@@ -22,20 +43,6 @@ def boxplus(map_from_body: Array, rot_trans: Array) -> Array:
     return se3(so3_exp(rot_trans[:3]) @ map_from_body[:3, :3], map_from_body[:3, 3] + rot_trans[3:])
 
 
-def innovation_of(measured: Array, cov_measured: Array, predicted: Array, covariance: Array) -> tuple[Array, float]:
-    """Return the innovation (6,) of a measured pose (4, 4), and its squared Mahalanobis distance."""
-    error = boxminus(measured, predicted)
-    return error, float(error @ np.linalg.solve(covariance + cov_measured, error))
-
-
-def kalman_update(map_from_body: Array, covariance: Array, error: Array, cov_measured: Array) -> tuple[Array, Array]:
-    """Return a pose and its covariance updated by a measured pose, which is off by `error` (6,). Source: Bucy and Joseph 1968."""
-    gain = np.linalg.solve(covariance + cov_measured, covariance).T  # K = P (P + R)^-1
-    rest = np.eye(6) - gain
-    updated = rest @ covariance @ rest.T + gain @ cov_measured @ gain.T  # (I - K) P (I - K)^T + K R K^T
-    return boxplus(map_from_body, gain @ error), updated
-
-
 def bounded_turn(covariance: Array) -> Array:
     """Return the covariance (6, 6) with each rotation sigma limited to pi; it remains positive semidefinite."""
     scale = np.ones(6)
@@ -44,14 +51,16 @@ def bounded_turn(covariance: Array) -> Array:
 
 
 class Place(NamedTuple):
-    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6).
+    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6), which includes the map's error.
 
-    floor: the site whose map it is in, of the robot's building; empty for the robot's own.
+    floor: the site whose map it is in, of the robot's building; empty for the robot's own. part_of_map (6, 6): covariance of its error
+    with the map's there, in sigmas of that; zero for a place that is not from the map.
     """
 
     map_from_body: Array
     cov_rot_trans: Array
     floor: str = ""
+    part_of_map: Array = _NO_PART
 
     @property
     def is_finite(self) -> bool:
@@ -68,14 +77,15 @@ class Place(NamedTuple):
     def moved(self, body_from_next: Array, cov_step: Array) -> "Place":
         """Return the place after a step. cov_step: a left perturbation in the body's axes about the body."""
         step = map(np.ascontiguousarray, (*self[:2], body_from_next, cov_step))
-        return Place(*core.compose_pose(*step), self.floor)
+        lever_m = self.map_from_body[:3, :3] @ body_from_next[:3, 3]
+        return Place(*core.compose_pose(*step), self.floor, self._part_after(lever_m, body_from_next))
 
     def at_end_of(self, way: "Place") -> "Place":
         """As `moved`, with the covariance of the way about its end, as for a hypothesis whose map is the body."""
         turn = turn_both(self.map_from_body[:3, :3])
         lever_m = self.map_from_body[:3, :3] @ way.position_m
         covariance = transport_cov(self.cov_rot_trans, lever_m) + turn @ way.cov_rot_trans @ turn.T
-        return Place(self.map_from_body @ way[0], covariance, self.floor)
+        return Place(self.map_from_body @ way[0], covariance, self.floor, self._part_after(lever_m, way.map_from_body))
 
     def before(self, way: "Place") -> "Place":
         """Return the place from which the way led here, the inverse of `at_end_of`."""
@@ -83,13 +93,48 @@ class Place(NamedTuple):
         turn = turn_both(map_from_earlier[:3, :3])
         cov_way = turn @ transport_cov(way.cov_rot_trans, -way.position_m) @ turn.T
         lever_m = map_from_earlier[:3, 3] - self.position_m
-        return Place(map_from_earlier, transport_cov(self.cov_rot_trans, lever_m) + cov_way, self.floor)
+        covariance = transport_cov(self.cov_rot_trans, lever_m) + cov_way
+        return Place(map_from_earlier, covariance, self.floor, self._part_after(lever_m, way.map_from_body))
 
     def of_point(self, body_from_point: Array) -> "Place":
         """Return the place of another frame of the same rigid body."""
         map_from_point = self.map_from_body @ body_from_point
         lever_m = map_from_point[:3, 3] - self.position_m
-        return Place(map_from_point, transport_cov(self.cov_rot_trans, lever_m), self.floor)
+        covariance = transport_cov(self.cov_rot_trans, lever_m)
+        return Place(map_from_point, covariance, self.floor, self._part_after(lever_m, np.eye(4)))
+
+    def _part_after(self, lever_m: Array, way: Array) -> Array:
+        """Return `part_of_map` at lever_m (3,) from here, after a way (4, 4)."""
+        part = self.part_of_map
+        if part is _NO_PART:
+            return part
+        way_m = length(way[:3, 3]) + _SCENE_M * rotation_angle_rad(way[:3, :3])
+        carried = np.vstack([part[:3], part[3:] - skew(lever_m) @ part[:3]])
+        return np.asarray(np.exp(-way_m / _MAP_LENGTH_M) * carried)
+
+    def by_map_of(self, sigmas: Array) -> "Place":
+        """Return the place by a map whose own error there has these sigmas (6,)."""
+        return self._replace(cov_rot_trans=self.cov_rot_trans + np.diag(sigmas**2), part_of_map=np.diag(sigmas))
+
+    def innovation_of(self, measured: "Place") -> tuple[Array, float]:
+        """Return the innovation (6,) of a measured place, and its squared Mahalanobis distance."""
+        error = boxminus(measured.map_from_body, self.map_from_body)
+        return error, float(error @ np.linalg.solve(self._cov_innovation(measured), error))
+
+    def _cov_innovation(self, measured: "Place") -> Array:
+        """The map's error in both of them cancels as far as it is the same."""
+        shared = self.part_of_map @ measured.part_of_map.T
+        return np.asarray(self.cov_rot_trans + measured.cov_rot_trans - shared - shared.T)
+
+    def updated(self, measured: "Place") -> "Place":
+        """Return the place updated by a measured one. Sources: Bucy and Joseph 1968, with the map's error as of Schmidt 1966."""
+        shared = self.part_of_map @ measured.part_of_map.T
+        gain = np.linalg.solve(self._cov_innovation(measured), self.cov_rot_trans - shared.T).T  # K = (P - C) S^-1
+        rest = np.eye(6) - gain
+        mixed = rest @ shared @ gain.T
+        covariance = rest @ self.cov_rot_trans @ rest.T + gain @ measured.cov_rot_trans @ gain.T + mixed + mixed.T
+        map_from_body = boxplus(self.map_from_body, gain @ boxminus(measured.map_from_body, self.map_from_body))
+        return Place(map_from_body, covariance, self.floor, rest @ self.part_of_map + gain @ measured.part_of_map)
 
 
 ORIGIN = Place(np.eye(4), np.zeros((6, 6)))  # of motions from a frame on

@@ -17,7 +17,7 @@ from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.place import ORIGIN, Place, innovation_of, kalman_update
+from locclient.localization.place import ORIGIN, Place
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import LocalizerSettings
@@ -48,9 +48,9 @@ OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given
 class Start:
     """Start state of a localizer; by default it searches the whole map.
 
-    map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
-    with their stamp_ns and support; else by a prior, with its is_revisable, is_told and travelled_m, the distance since its arrival.
-    has_broken: tracks were lost since. was_tracking: the robot knew its pose before; is_carried: it was lifted since.
+    map_from_body (4, 4), cov_rot_trans, part_of_map (6, 6): the `Place` at frame `frame_index` of the odometry, None without one.
+    is_confirmed: by fixes, with their stamp_ns and support; else by a prior, with its is_revisable, is_told and travelled_m, the distance
+    since its arrival. has_broken: tracks were lost since. was_tracking: the robot knew its pose before; is_carried: it was lifted since.
     failed_queries: number of failed map queries in a row. floor: whose map the pose is in, empty for the robot's own site.
     """
 
@@ -59,6 +59,7 @@ class Start:
     support: int = 0
     map_from_body: Array | None = None
     cov_rot_trans: Array | None = None
+    part_of_map: Array | None = None
     is_confirmed: bool = False
     is_revisable: bool = False
     is_told: bool = True
@@ -182,6 +183,8 @@ class PoseTracker:
         if start.map_from_body is None or start.cov_rot_trans is None:
             return
         place = Place(start.map_from_body, start.cov_rot_trans, start.floor)
+        if start.part_of_map is not None:
+            place = place._replace(part_of_map=start.part_of_map)
         known = PoseHypothesis(start.frame_index, start.stamp_ns, place, place, support=start.support)
         known.has_broken, self.floor = start.has_broken, start.floor
         if start.is_confirmed:
@@ -288,7 +291,7 @@ class PoseTracker:
         for each in self._unmatched:
             own = self._mounted[each.view].camera
             if self._is_aside(each) and replace(own, baseline_m=lens.baseline_m) == lens:
-                earlier_from_query, covariance, _ = each.frame.then
+                earlier_from_query, covariance, *_ = each.frame.then
                 cam_from_query = se3_inverse(each.body_from_cam) @ earlier_from_query @ self.body_from_cam
                 features = each.features if own == lens else each.features.without_depth()
                 found.append(EarlierFrame(features, cam_from_query, covariance))
@@ -326,12 +329,13 @@ class PoseTracker:
             return True
         if known is None or fix.inliers < self._settings.fix.min_inliers or not at.now.shares_map(known.now):
             return False
-        _, innovation = innovation_of(*at.now[:2], *known.now[:2])
+        _, innovation = known.now.innovation_of(at.now)
         return innovation <= self.settings.innovation_limit
 
     def place_by(self, fix: Fix) -> Place:
-        """Return the place of the body by a fix of the last query."""
-        return Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
+        """Return the place of the body by a fix of the last query, and by the map's own error there."""
+        place = Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
+        return place.by_map_of(self.maps.map_sigmas(place))
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
         """Return True if fixes, none within the prior, contradict it by now; then drop it: their places must be confirmed."""
@@ -346,13 +350,12 @@ class PoseTracker:
         """Update the confirmed pose at the frame of the query (Kalman). Fixes beyond its chi-square gate are refused, and so are
         several within it: long without a fix, the gate may include an alias of the pose.
 
-        Sources: Bar-Shalom et al. 2001 (validation gate), Bucy and Joseph 1968 (covariance update).
+        Source: Bar-Shalom et al. 2001 (validation gate).
         """
         assert self._query_frame is not None
         if not fixes:
             return NO_AGREEMENT
-        map_from_body, covariance, _ = confirmed.then
-        innovations = [(fix, *innovation_of(*self.place_by(fix)[:2], map_from_body, covariance)) for fix in fixes]
+        innovations = [(fix, *confirmed.then.innovation_of(self.place_by(fix))) for fix in fixes]
         # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
         limit = self.settings.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
@@ -364,8 +367,7 @@ class PoseTracker:
                 return QueryResult(None, f"{len(gated)} places match the image", innovation)
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
             return QueryResult(None, reason, innovation, off_m if is_near else None)
-        updated = kalman_update(map_from_body, covariance, error, self.place_by(fix).cov_rot_trans)
-        self.confirmed = PoseHypothesis.at_query(self._query_frame, Place(*updated, confirmed.now.floor))
+        self.confirmed = PoseHypothesis.at_query(self._query_frame, confirmed.then.updated(self.place_by(fix)))
         self.confirmed.support = confirmed.support + 1
         self.candidates.reset()
         return QueryResult(fix, "", innovation, off_m)

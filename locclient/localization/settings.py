@@ -35,14 +35,13 @@ class TrackSettings(Section, frozen=True):
     telling_evidence: float = 6.0  # a sequential test at this limit errs in one case of 400 (Wald 1945)
     evidence_kept_share: float = 0.8  # decay of a hypothesis's inliers from fix to fix
     max_misses: int = 4  # contradicting fixes in a row that end a hypothesis
-    drift_share: float = 0.01  # odometry error beyond its own covariance, as a share of the distance
-    drift_floor_m: float = 0.005  # the same for each step
+    drift_share: float = 0.005  # odometry error beyond its own covariance, as a share of the distance
+    drift_floor_m: float = 0.001  # the same from fix to fix
+    drift_rad: float = 0.0003  # the same of the rotation
     degraded_after_s: float = 0.9
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
     kidnap_fixes: int = 3
-    map_sigma_m: float = 0.02  # of the map itself, added to the estimate
-    map_sigma_rad: float = 0.006  # of the map itself, added to the estimate
 
 
 class LocalizerSettings(Section, frozen=True):

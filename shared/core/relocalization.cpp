@@ -67,7 +67,7 @@ struct FixLimits {
   double guided_ratio;                  // best over second best
   double feature_sigma_px;              // at the finest octave
   double disparity_sigma_px;            // at every octave
-  double covariance_scale;              // of the fix's own: matches share errors of the map
+  double covariance_scale;              // of the fix's own
   double floor_rad, floor_m;            // smallest sigmas
   double octave_scale, distance_scale;  // as visible_landmarks takes them
   double min_disparity_px;              // smaller ones count as unknown depth

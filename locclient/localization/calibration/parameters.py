@@ -46,7 +46,7 @@ PARAMETERS = (
 Floors: usual difference of scales and rotations between good pairs and the survey's, by calibration and by the effect of lighting on
 stereo matching. Limits: focal length, 1.5 cm at 3 m; the pair, an error of a few centimetres at 3 m in some places (0.05 degrees of
 yaw are a third of a pixel of disparity). pair_pitch_deg: half a pixel off the row costs stereo matching a third of its points.
-Rotations of the camera: beyond the published covariance (`TrackSettings.map_sigma_rad`).
+Rotations of the camera: beyond what the rotation of an unmeasured map may be wrong by (`UNKNOWN_ERROR`).
 """
 TIME_OFFSET = Parameter("time_offset_s", 1.0, 0.0005, 0.01, "time of the cameras against the IMU")
 """Estimated and corrected by the odometry, so that a drift is reported but causes no error. Limit: 2 cm at 2 m/s."""

@@ -90,7 +90,7 @@ class Prior:
         """Return the present place by the prior on each of its floors; empty without a heading."""
         if self.hypothesis is None:
             return []
-        (map_from_body, covariance, _), found = self.hypothesis.now, list[Place]()
+        map_from_body, covariance, found = *self.hypothesis.now[:2], list[Place]()
         for floor, prior_from_map in self.floors.items():
             there = map_from_body if prior_from_map is None else se3_inverse(prior_from_map) @ map_from_body
             found.append(Place(there, covariance, floor))

@@ -13,7 +13,7 @@ from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame
 from fleetmap.sensors.samples import PositionPrior
 from locclient.hooks import PriorHook
 from locclient.localization.estimate import Estimate
-from locclient.localization.place import Place, boxminus, innovation_of
+from locclient.localization.place import Place, boxminus
 
 _CHECK_NS = 500_000_000  # between two looks for markers while the robot knows its place
 _GATE = 22.458  # squared Mahalanobis distance: 0.999 of chi-square, 6 degrees of freedom
@@ -65,7 +65,7 @@ class MarkerPriors:
             assert estimate.map_from_body is not None and estimate.cov_rot_trans is not None
             claimed = Place(estimate.map_from_body, estimate.cov_rot_trans).of_point(se3_inverse(self._base_from_body))
             for number, place in self._seen.items():
-                is_elsewhere = innovation_of(*place[:2], *claimed[:2])[1] > _GATE
+                is_elsewhere = claimed.innovation_of(place)[1] > _GATE
                 self._contradictions[number] = self._contradictions[number] + 1 if is_elsewhere else 0
             self._told = {number for number in self._told if self._contradictions[number]}
         moved = [str(number) for number in sorted(self._markers) if self._is_moved(number)]

@@ -28,9 +28,9 @@ class FixSettings(Section, frozen=True):
     disparity_sigma_px: float = 0.2  # at every scale
     ransac_px: float = 5.0  # inlier distance
     rotation_sigma_rad: float = 0.03  # of the rotation that gravity and odometry predict
-    covariance_scale: float = 4.0  # factor on the fix's own covariance: matches share errors of the map
-    floor_m: float = 0.01  # smallest sigma of a fix
-    floor_rad: float = 0.002  # smallest sigma of a fix
+    covariance_scale: float = 1.2  # factor on the fix's own covariance: residuals are not quite independent
+    floor_m: float = 0.002  # smallest sigma of a fix, besides the error of the map: what many matches share
+    floor_rad: float = 0.0003  # the same of its rotation
     max_view_angle_deg: float = 75.0  # outside the directions from which a landmark was seen
 
 

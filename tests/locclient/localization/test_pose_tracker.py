@@ -181,7 +181,7 @@ def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
     rng = np.random.default_rng(seed)
     known, way = Place(place(rng), spd(rng)), Place(place(rng), spd(rng))
     pairs = list(zip(drawn(*known[:2], rng), drawn(*way[:2], rng), strict=True))
-    for (mean, claimed, _), found in (
+    for (mean, claimed, *_), found in (
         (known.before(way), [at @ se3_inverse(since) for at, since in pairs]),
         (known.at_end_of(way), [at @ since for at, since in pairs]),
     ):
@@ -199,3 +199,31 @@ def test_there_and_back_is_where_one_began() -> None:
     again = known.at_end_of(way).before(way)
     np.testing.assert_allclose(again.map_from_body, known.map_from_body, atol=1e-12)
     np.testing.assert_allclose(again.cov_rot_trans, known.cov_rot_trans, atol=1e-12)
+
+
+@pytest.mark.parametrize("sigmas_mm", [(6.0, 6.0), (20.0, 4.0)])
+def test_a_place_by_many_fixes_is_as_wrong_as_it_says(sigmas_mm: tuple[float, float]) -> None:
+    """Fixes share the error of the map, which changes along the way, and from one tile to the next."""
+    rng, runs, fixes = np.random.default_rng(11), 80, 25
+    step = se3(so3_exp(np.array([0.0, 0.0, 0.04])), np.array([0.6, 0.0, 0.0]))
+    kept = np.exp(-(0.6 + 3.0 * 0.04) / 5.0)
+    white, cov_step = np.diag([4e-7] * 3 + [1.6e-5] * 3), np.diag([1e-7] * 3 + [9e-6] * 3)
+    nees, gates = list[Array](), list[float]()
+    for _ in range(runs):
+        truth, of_map, at = place(rng), rng.normal(size=6), Place(np.eye(4), np.eye(6))
+        for number in range(fixes):
+            sigmas = np.repeat([1.2e-3, 1e-3 * sigmas_mm[number > fixes // 2]], 3)
+            seen = boxplus(truth, sigmas * of_map + rng.multivariate_normal(np.zeros(6), white))
+            fix = Place(seen, white).by_map_of(sigmas)
+            if number:
+                gates.append(at.innovation_of(fix)[1])
+            at = at.updated(fix) if number else fix
+            truth, of_map = truth @ step, kept * of_map + np.sqrt(1.0 - kept**2) * rng.normal(size=6)
+            slip = boxplus(np.eye(4), rng.multivariate_normal(np.zeros(6), cov_step))
+            at = at.moved(slip @ step, cov_step)
+            error = boxminus(at.map_from_body, truth)
+            nees.append(np.linalg.solve(np.linalg.cholesky(at.cov_rot_trans), error) ** 2)
+    assert np.mean(gates) / 6 == pytest.approx(1.0, abs=0.05)
+    assert np.mean(np.array(gates) > SETTINGS.innovation_limit) < 0.003
+    turned, moved = np.mean(nees, axis=0).reshape(2, 3).mean(axis=1)
+    assert (turned, moved) == (pytest.approx(1.0, abs=0.2), pytest.approx(1.0, abs=0.2))
