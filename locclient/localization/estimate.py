@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +40,8 @@ class Estimate:
     clock. calibration: its state by the map. view_causes: faults of the images of each view of the rig, NONE for good ones;
     view: the one of the last map query.
     floor: site whose map the pose and map_version are of, in a building; empty for the robot's own. Without a pose the last known one.
+    protection_m, protection_deg: the errors of position, of body and base, and of rotation are larger with a probability of at most
+    `TrackSettings.protection_risk`; infinite where nothing can be promised.
     """
 
     stamp_ns: int
@@ -61,6 +64,8 @@ class Estimate:
     view_causes: tuple[Cause, ...] = (Cause.NONE,)
     view: int = 0
     floor: str = ""
+    protection_m: float = inf
+    protection_deg: float = inf
 
     @property
     def is_at_home(self) -> bool:

@@ -19,6 +19,7 @@ from locclient.localization.perception import Percept, Perception
 from locclient.localization.pose_tracker import PoseTracker, QueryResult, Start
 from locclient.localization.priors.given import GivenPrior
 from locclient.localization.priors.lift_ride import LiftRide
+from locclient.localization.protection import ProtectionMonitor
 from locclient.localization.settings import LocalizerSettings
 
 
@@ -37,6 +38,7 @@ class Localizer:
         self.maps = HeldMaps()
         self._tracker = PoseTracker(settings, rig.mounted, rig.base_from_body, self.maps)
         self._query = MapQuery(self._tracker, settings, len(rig.mounted))
+        self._protection = ProtectionMonitor(self._tracker, settings.track)
         self._tracker.on_restart.append(self._calibration.give_up)
         self._given = GivenPrior(self._tracker)
         self._lift = LiftRide(self._tracker, self.perception.gauge)
@@ -48,6 +50,7 @@ class Localizer:
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self.perception.handle_wheel(samples)
         self._calibration.watch.wheels.handle(samples)
+        self._protection.has_wheels |= bool(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """Use a prior from the next frame on until a pose is confirmed, with a covariance that grows with the distance since. One with
@@ -136,6 +139,7 @@ class Localizer:
             )
             percept.calibration = self._calibration.state
         result = self._query.step(percept, frame, is_riding=self._lift.is_riding)
+        self._protection.handle(result)
         if frame is not None:
             finished = self._query.finished
             if finished is not None and finished.fix is not None:
@@ -166,4 +170,5 @@ class Localizer:
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self.maps.version_on(estimate.floor))
         fixed_ns = None if tracker.confirmed is None or percept.is_reversed else tracker.confirmed.stamp_ns
-        return with_calibration(estimate, self._rig, fixed_ns, was_localized=tracker.was_tracking)
+        estimate = with_calibration(estimate, self._rig, fixed_ns, was_localized=tracker.was_tracking)
+        return self._protection.judged(estimate)

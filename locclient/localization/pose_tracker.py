@@ -118,6 +118,9 @@ class PoseTracker:
         self._imu_ns: int | None = None  # stamp of the last frame with an IMU, None once its loss is a doubt
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
+        # Of the last map query, and that from which another part follows the motion: propagated like the pose, of no effect on it.
+        self.asked: PoseHypothesis | None = None
+        self.followed: PoseHypothesis | None = None
         self.floor = ""  # of the last confirmed pose
         self._unmatched: list[_Unmatched] = []  # frames of queries since the last fix
 
@@ -239,6 +242,8 @@ class PoseTracker:
         if self.confirmed is not None:
             found.append(self.confirmed)
         found.extend(each.frame for each in self._unmatched)
+        if self.followed is not None:
+            found.append(self.followed)
         if self._query_frame is not None and all(each.frame is not self._query_frame for each in self._unmatched):
             found.append(self._query_frame)  # kept while its search goes on, it must not move twice
         return found
@@ -255,7 +260,7 @@ class PoseTracker:
         self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
             hypothesis.then = hypothesis.now
-        self._query_frame = PoseHypothesis.at(odometry)
+        self._query_frame = self.asked = PoseHypothesis.at(odometry)
         self._query_index = odometry.frame_index
 
     def _doubt_confirmed(self, odometry: OdometryEstimate) -> None:

@@ -1,5 +1,9 @@
 """Settings of the localization client; the same for every robot."""
 
+from typing import Annotated
+
+import msgspec
+
 from fleetmap.config import Section
 from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.odometry.settings import OdometrySettings
@@ -42,6 +46,8 @@ class TrackSettings(Section, frozen=True):
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
     kidnap_fixes: int = 3
+    # Probability that a pose's error exceeds its protection level, for each fix; see docs/warranty.md
+    protection_risk: Annotated[float, msgspec.Meta(ge=1e-9, le=0.1)] = 1e-5
 
 
 class LocalizerSettings(Section, frozen=True):

@@ -31,23 +31,13 @@ void linearize(const Sightings& seen, const StereoLens& lens, double width, cons
     const Vec3 from_first = cam_from_source * seen.points[n];
     const SE3* const camera = seen.cameras_from_first == nullptr ? nullptr : seen.cameras_from_first + seen.cameras[n];
     const Vec3 point = camera == nullptr ? from_first : *camera * from_first;
-    const double x = point[0], y = point[1], z = point[2];
     squared[n] = kUnseen;
-    if (z < kNearest) {
+    if (point[2] < kNearest) {
       normal.cost += 0.5 * width * width;
       continue;
     }
-    const Vec3 pixel = seen.pixels[n];
-    const double inverse = 1.0 / z;
-    const bool is_stereo = !std::isnan(pixel[2]) && lens.focal_baseline > 0.0;
-    const double w = seen.weights[n][0], w_disparity = is_stereo ? seen.weights[n][1] : 0.0;
-    const double residual[3] = {(lens.focal * x * inverse + lens.cx - pixel[0]) * w, (lens.focal * y * inverse + lens.cy - pixel[1]) * w,
-                                is_stereo ? (lens.focal_baseline * inverse - (pixel[0] - pixel[2])) * w_disparity : 0.0};
-    // d residual / d point, and by the step: the point moves by turn x point + shift.
-    const Vec3 by_point[3] = {{lens.focal * inverse * w, 0.0, -lens.focal * x * inverse * inverse * w},
-                              {0.0, lens.focal * inverse * w, -lens.focal * y * inverse * inverse * w},
-                              {0.0, 0.0, -lens.focal_baseline * inverse * inverse * w_disparity}};
-    double jacobian[3][6];
+    const auto [residual, by_point] = residuals_of(point, seen.pixels[n], seen.weights[n], lens);
+    double jacobian[3][6];  // by the step: the point moves by turn x point + shift
     for (int k = 0; k < 3; ++k) {
       const Vec3 by_first = camera == nullptr ? by_point[k] : transposed(camera->rotation) * by_point[k];
       store(cross(from_first, by_first), jacobian[k]), store(by_first, jacobian[k] + 3);

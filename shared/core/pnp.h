@@ -2,6 +2,7 @@
 #pragma once
 
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <optional>
@@ -22,6 +23,23 @@ struct Sightings {
   const uint8_t* cameras = nullptr;  // (count,)
   const SE3* cameras_from_first = nullptr;
 };
+
+// What a camera's pixels of a point before it (camera axes) are off by, of u, v and the disparity, times their weights, and the derivatives
+// by the point. Zero for a disparity that is not known.
+struct Residuals {
+  std::array<double, 3> residual;
+  std::array<Vec3, 3> by_point;
+};
+inline Residuals residuals_of(Vec3 point, Vec3 pixel, const std::array<double, 2>& weights, const StereoLens& lens) {
+  const double x = point[0], y = point[1], inverse = 1.0 / point[2];
+  const bool is_stereo = !std::isnan(pixel[2]) && lens.focal_baseline > 0.0;
+  const double w = weights[0], w_disparity = is_stereo ? weights[1] : 0.0;
+  return {{(lens.focal * x * inverse + lens.cx - pixel[0]) * w, (lens.focal * y * inverse + lens.cy - pixel[1]) * w,
+           is_stereo ? (lens.focal_baseline * inverse - (pixel[0] - pixel[2])) * w_disparity : 0.0},
+          {{{lens.focal * inverse * w, 0.0, -lens.focal * x * inverse * inverse * w},
+            {0.0, lens.focal * inverse * w, -lens.focal * y * inverse * inverse * w},
+            {0.0, 0.0, -lens.focal_baseline * inverse * inverse * w_disparity}}}};
+}
 
 // Sightings that are chosen one by one.
 struct ChosenSightings {

@@ -228,11 +228,6 @@ std::optional<Resection> with_rotation(const Sightings& seen, const StereoLens& 
   return refine_from(best_camera, seen, lens, refinement, prior, agreement);
 }
 
-Sightings sightings_of(const Points& points, const Points& pixels, const Places& weights) {
-  check_rows(points.shape(0), "pixels and weights: one row for each point", pixels, weights);
-  return {points.rows(), pixels.rows(), reinterpret_cast<const std::array<double, 2>*>(weights.data()), points.shape(0)};
-}
-
 Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
 
 using Result = std::optional<std::tuple<SE3, Mat6, std::vector<double>>>;

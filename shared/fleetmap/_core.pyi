@@ -126,6 +126,34 @@ def visible_landmarks(
     pinhole: focal, cx, cy, focal * baseline, width, height. max_view_angle_rad: largest angle of view outside a landmark's cone.
     """
 
+class ProtectionBank:
+    """Filters of the pose of which each never used one group of a fix's matches, one fix, or the odometry. See docs/warranty.md."""
+
+    def __init__(self) -> None: ...
+    def update(
+        self,
+        points: _Reals,
+        pixels: _Reals,
+        weights: _Reals,
+        lens: _Reals,
+        refinement: tuple[float, float, tuple[int, int]],
+        map_from_body: _Reals,
+        body_from_cam: _Reals,
+        size_px: tuple[float, float],
+        base_z_m: float,
+        stamp_s: float,
+        way: _Reals,
+        cov_way: _Reals,
+    ) -> None:
+        """Update by a fix, map_from_body (4, 4), and its matches as of refine_pnp. way (4, 4): of the body since the last fix, with its
+        covariance (6, 6) about its end. base_z_m: height of the robot's base in the map."""
+
+    def level(
+        self, map_from_body: _Reals, way: _Reals, cov_way: _Reals, cov_map: _Reals, point: _Reals, risk: float
+    ) -> tuple[float, float]:
+        """Levels, metres and radians, of a pose at the end of a way since the last fix; infinite without one. cov_map (6, 6): of the map's
+        own error there. point (3,): of the body; the position is that of both. risk: probability of an error beyond a level."""
+
 class FixFinder:
     """Finds places of frames in the landmarks (N) and places (K) of one map, by the settings of relocalization and of disparities.
 

@@ -48,3 +48,8 @@ inline fleetmap::ImuSamples imu_samples(const Indices& stamps_ns, const Points& 
   check_rows(count, "gyro_radps, accel_mps2: a row for each of stamps_ns", gyro_radps, accel_mps2);
   return {stamps_ns.data(), gyro_radps.data(), accel_mps2.data(), count};
 }
+
+inline fleetmap::Sightings sightings_of(const Points& points, const Points& pixels, const Places& weights) {
+  check_rows(points.shape(0), "pixels and weights: one row for each point", pixels, weights);
+  return {points.rows(), pixels.rows(), reinterpret_cast<const std::array<double, 2>*>(weights.data()), points.shape(0)};
+}

@@ -26,8 +26,8 @@ namespace fleetmap {
 using Bind = void(nb::module_&);
 Bind bind_aliases, bind_bundle, bind_camera, bind_corners, bind_dense_stereo, bind_filter, bind_grid, bind_image_quality, bind_image_rows,
     bind_imu_checks, bind_landmarks, bind_matching, bind_mono_window, bind_pair_matching, bind_patch_align, bind_png, bind_pnp,
-    bind_preintegration, bind_projection, bind_rays, bind_relocalization, bind_remap, bind_render, bind_stereo, bind_surfels, bind_tracking,
-    bind_vocabulary;
+    bind_preintegration, bind_projection, bind_protection, bind_rays, bind_relocalization, bind_remap, bind_render, bind_stereo,
+    bind_surfels, bind_tracking, bind_vocabulary;
 
 }  // namespace fleetmap
 
@@ -53,9 +53,9 @@ NB_MODULE(_core, module) {
   using namespace fleetmap;
   module.def("allocations", [] { return step_allocations; });
   for (Bind* const bind :
-       {bind_dense_stereo,  bind_aliases,    bind_bundle,     bind_camera,         bind_corners,    bind_filter,      bind_grid,
-        bind_image_quality, bind_image_rows, bind_imu_checks, bind_landmarks,      bind_matching,   bind_mono_window, bind_pair_matching,
-        bind_patch_align,   bind_png,        bind_pnp,        bind_preintegration, bind_projection, bind_rays,        bind_relocalization,
-        bind_remap,         bind_render,     bind_stereo,     bind_surfels,        bind_tracking,   bind_vocabulary})
+       {bind_dense_stereo,   bind_aliases,    bind_bundle,     bind_camera,         bind_corners,    bind_filter,      bind_grid,
+        bind_image_quality,  bind_image_rows, bind_imu_checks, bind_landmarks,      bind_matching,   bind_mono_window, bind_pair_matching,
+        bind_patch_align,    bind_png,        bind_pnp,        bind_preintegration, bind_projection, bind_protection,  bind_rays,
+        bind_relocalization, bind_remap,      bind_render,     bind_stereo,         bind_surfels,    bind_tracking,    bind_vocabulary})
     bind(module);
 }

@@ -1,0 +1,115 @@
+"""Protection level of the published pose: what its error exceeds with at most a stated probability. Pure.
+
+It reads the tracker, its fixes and the calibration's state; no estimate and no status depends on it. Method: docs/warranty.md.
+"""
+
+from dataclasses import replace
+from math import log
+
+import numpy as np
+
+from fleetmap import core
+from fleetmap.geometry import length, se3_inverse
+from fleetmap.messages import Status
+from fleetmap.pnp.pnp import REFINEMENT
+from locclient.localization.alias_disambiguation import is_other_viewpoint
+from locclient.localization.calibration.parameters import HEIGHT, PARAMETERS, TILT, TIME_OFFSET
+from locclient.localization.estimate import Estimate
+from locclient.localization.place import ORIGIN
+from locclient.localization.pose_tracker import PoseTracker, QueryResult
+from locclient.localization.priors.prior import Prior
+from locclient.localization.settings import TrackSettings
+
+_WRONG_SHARE = 0.05  # of other places that match as one look does, at least: views of one rack are not independent
+_LOOK_M = 0.5  # between such looks
+_MOUNTING = PARAMETERS[TILT.start : HEIGHT]
+
+
+class ProtectionMonitor:
+    """Protection levels of a localizer's estimates, by a bank of filters of which each never used some of the measurements.
+
+    A bank begins with the first fix of a confirmed pose and ends with that pose. Fixes from one viewpoint share their errors: the bank
+    uses the first of them. The log odds that the robot is here, and not at a place that looks the same, grow with each other look.
+    """
+
+    def __init__(self, tracker: PoseTracker, settings: TrackSettings) -> None:
+        self._tracker, self._settings = tracker, settings
+        self._base_point = np.ascontiguousarray(se3_inverse(tracker.base_from_body)[:3, 3])  # in the body
+        self._prior: Prior | None = None  # the last one before the pose was confirmed
+        self.has_wheels = False
+        self._reset()
+        tracker.on_restart.append(self._reset)
+
+    def _reset(self) -> None:
+        self._bank, self._log_odds, self._fix_ns, self._tracker.followed = core.ProtectionBank(), 0.0, 0, None
+        self._is_refused = False  # the last fix contradicts the pose
+
+    def handle(self, result: QueryResult) -> None:
+        """Use the map query that finished with this frame, if any did."""
+        tracker, fix, way = self._tracker, result.fix, self._tracker.followed
+        confirmed, asked, stamp_ns = tracker.confirmed, tracker.asked, result.fix_stamp_ns
+        if confirmed is None:
+            self._prior = tracker.prior
+            self._reset()
+            return
+        if stamp_ns is None or asked is None:
+            return
+        lookalikes = tracker.maps.lookalikes
+        share = 0.0 if lookalikes is None else min(lookalikes.max_wrong_share, 1.0)
+        evidence = -log(max(share, _WRONG_SHARE))  # of a look: how rarely another place shows as much
+        if way is not None:
+            evidence *= min(1.0, length(way.then.position_m) / _LOOK_M)
+        if fix is None or fix.matched is None:
+            self._is_refused |= result.innovation is not None
+            self._log_odds -= 0.0 if way is None else evidence
+            return
+        self._fix_ns, self._is_refused = stamp_ns, False
+        if way is not None and not is_other_viewpoint(way.then.map_from_body):
+            return
+        matched, place, camera = fix.matched, tracker.place_by(fix), fix.matched.camera
+        measured = matched.points_source, matched.pixels, 1.0 / matched.sigmas_px
+        points, pixels, weights = map(np.ascontiguousarray, measured)
+        moved, cov_moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
+        self._bank.update(
+            points,
+            pixels,
+            weights,
+            camera.lens,
+            REFINEMENT,
+            place.map_from_body,
+            tracker.body_from_cam,
+            (camera.width_px, camera.height_px),
+            float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2]),
+            1e-9 * stamp_ns,
+            moved,
+            cov_moved,
+        )
+        tracker.followed = asked
+        looks = 1 if way is not None else min(confirmed.support, 1 + int(confirmed.travelled_m / _LOOK_M))
+        self._log_odds += looks * evidence if lookalikes is None or fix.landmark_recall > lookalikes.recall else 0.0
+        if way is None and self._prior is not None and self._prior.confirms(confirmed):
+            wrong = self._settings.wrong_prior_share if self._prior.is_revisable else self._settings.protection_risk
+            self._log_odds -= log(wrong)
+
+    def judged(self, estimate: Estimate) -> Estimate:
+        """Return the estimate with its levels: infinite where no level holds."""
+        tracker, settings, way = self._tracker, self._settings, self._tracker.followed
+        map_from_body, confirmed, risk = estimate.map_from_body, tracker.confirmed, settings.protection_risk
+        if estimate.status not in {Status.TRACKING, Status.DEGRADED} or map_from_body is None:
+            return estimate
+        if confirmed is None or way is None:
+            return estimate
+        is_late = (estimate.stamp_ns - self._fix_ns) * 1e-9 > settings.degraded_after_s
+        is_doubted = self._is_refused or any(h.speaks_against_others(settings) for h in tracker.candidates.hypotheses)
+        if is_late or is_doubted or self._log_odds < -log(risk):
+            return estimate
+        here, moved, cov_moved = map(np.ascontiguousarray, (map_from_body, *way.now[:2]))
+        cov_map = tracker.maps.map_cov(confirmed.now)
+        level_m, level_rad = self._bank.level(here, moved, cov_moved, cov_map, self._base_point, risk)
+        drifts = {drift.parameter: abs(drift.value) + drift.sigma for drift in estimate.calibration.drifts}
+        turned_rad = length(np.array([drifts.get(parameter, 0.0) for parameter in _MOUNTING]))
+        level_m += turned_rad * length(self._base_point) + drifts.get(PARAMETERS[HEIGHT], 0.0)
+        level_m += TIME_OFFSET.limit * length(estimate.odometry.velocity_odom_mps) if self.has_wheels else 0.0
+        if level_m > 0.5 * tracker.maps.alias_step_m:  # the next place that looks alike would be within
+            return estimate
+        return replace(estimate, protection_m=level_m, protection_deg=float(np.degrees(level_rad + turned_rad)))

@@ -1,0 +1,243 @@
+// The protection level of a pose: what its error exceeds with at most a stated probability, whatever happened to one group of landmarks, to
+// one fix, or to the odometry. Method, assumptions and sources: docs/warranty.md.
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <numbers>
+#include <vector>
+
+#include "dense.h"
+
+namespace fleetmap {
+namespace {
+
+constexpr double kOften = 1e-2, kSeldom = 1e-3;            // priors of faults, for each fix
+constexpr double kWhite = 1.6;                             // variance of matches' independent errors, over what they state
+constexpr double kOverbound = 1.56;                        // of a mode's covariance: tails are heavier than a Gaussian's
+constexpr double kAnywhereRad = 1.0, kAnywhereM = 30.0;    // sigmas of a mode that knows nothing
+constexpr double kForgottenS = 20.0;                       // after a group was last seen
+constexpr double kCellM = 2.0, kZoneM = 8.0, kLowM = 1.0;  // squares of the map; the height above the base that divides it
+constexpr int kColumns = 4, kRows = 3;                     // parts of the image
+constexpr double kFarthest = 1e7;                          // metres, and pixels
+constexpr double kUnknown = std::numeric_limits<double>::infinity();
+
+// What a mode never used, with the number of a part of the image or of the map. The first three are of one fix: the next makes them anew.
+enum class Without { kFix, kAllBefore, kMatch, kNothing, kDisparities, kSide, kHalf, kDepth, kHeight, kImage, kCell, kZone };
+struct Group {
+  Without what;
+  int column = 0, row = 0;
+  auto operator<=>(const Group&) const = default;
+};
+double prior_of(Without what) { return what == Without::kMatch || what == Without::kImage || what == Without::kCell ? kOften : kSeldom; }
+
+// A filter of the pose; its perturbation is that of compose_pose.
+struct Mode {
+  Group group;
+  SE3 map_from_body;
+  Mat6 covariance;
+  double seen_s;
+};
+
+// The normal equations of matches on a perturbation of the fix: information, and in the last column the gradient of the cost.
+struct Sums {
+  double at[42]{};
+
+  void add(const double* row, double weight) {
+    for (int a = 0; a < 6; ++a)
+      for (int b = 0; b < 7; ++b) at[7 * a + b] += weight * row[a] * row[b];
+  }
+  void add(const Sums& other, double sign = 1.0) {
+    for (int k = 0; k < 42; ++k) at[k] += sign * other.at[k];
+  }
+};
+
+// The inverse of a symmetric positive definite matrix; not finite where it is none.
+Mat6 inverse_spd(Mat6 matrix) {
+  Mat6 inverse{};
+  const double one = cholesky_in_place(matrix.at, 6, 6) ? 1.0 : kUnknown;
+  for (int row = 0; row < 6; ++row) {
+    inverse[row][row] = one;
+    forward_substitute(matrix.at, inverse[row], 6, 6), back_substitute(matrix.at, inverse[row], 6, 6);
+  }
+  return inverse;
+}
+
+// The root of the largest eigenvalue of a covariance, the largest sigma. Source: Smith 1961.
+double widest(const Mat3& m) {
+  const double mean = trace(m) / 3.0;
+  const Mat3 rest = m - mean * kIdentity;
+  const Vec3 x = vec3(rest[0]), y = vec3(rest[1]), z = vec3(rest[2]);
+  const double size = std::sqrt((dot(x, x) + dot(y, y) + dot(z, z)) / 6.0);
+  const double cosine = size > 0.0 ? 0.5 * dot(x, cross(y, z)) / (size * size * size) : 1.0;
+  return std::sqrt(mean + 2.0 * size * std::cos(std::acos(std::clamp(cosine, -1.0, 1.0)) / 3.0));
+}
+
+// The length that a vector of three independent standard normal numbers exceeds with this probability: chi, 3 degrees of freedom.
+double factor_of(double probability) {
+  double low = 0.0, high = 40.0;
+  for (int k = 0; k < 60; ++k) {
+    const double at = 0.5 * (low + high);
+    const double beyond = std::erfc(at / std::numbers::sqrt2) + std::sqrt(2.0 / std::numbers::pi) * at * std::exp(-0.5 * at * at);
+    (beyond > probability ? low : high) = at;
+  }
+  return high;
+}
+
+// The covariance about a point of the body, `lever` from its origin in map axes.
+Mat6 about(const Mat6& covariance, Vec3 lever) {
+  double carried[36]{};
+  for (const int corner : {0, 21}) store(kIdentity, carried + corner, 6);
+  store(-1.0 * skew(lever), carried + 18, 6);
+  Mat6 out;
+  carry<6, 6>(carried, covariance.at, out.at);
+  return out;
+}
+
+// Moves a mode by a way of the body, whose covariance is about its end.
+void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
+  double turn[36]{};
+  for (const int corner : {0, 21}) store(mode.map_from_body.rotation, turn + corner, 6);
+  Mat6 turned;
+  carry<6, 6>(turn, cov_way.at, turned.at);
+  mode.covariance = about(mode.covariance, mode.map_from_body.rotation * way.translation) + turned;
+  mode.map_from_body = mode.map_from_body * way;
+}
+
+// Updates a mode by a fix: by the perturbation of the fix's pose that minimises the sum of both costs.
+void update(Mode& mode, const SE3& fix, const Sums& sums) {
+  const Mat6 before = inverse_spd(mode.covariance);
+  Mat6 information = before;
+  double off[6], slope[6], step[6] = {};
+  store(so3_log(mode.map_from_body.rotation * transposed(fix.rotation)), off);
+  store(mode.map_from_body.translation - fix.translation, off + 3);
+  for (int a = 0; a < 6; ++a) {
+    slope[a] = -sums.at[7 * a + 6];
+    for (int b = 0; b < 6; ++b) slope[a] += before[a][b] * off[b], information[a][b] += sums.at[7 * a + b];
+  }
+  mode.covariance = inverse_spd(information);
+  for (int a = 0; a < 6; ++a)
+    for (int b = 0; b < 6; ++b) step[a] += mode.covariance[a][b] * slope[b];
+  mode.map_from_body = {so3_exp(vec3(step)) * fix.rotation, fix.translation + vec3(step + 3)};
+}
+
+double median(std::vector<double> values) {
+  if (values.empty()) return 0.0;
+  std::nth_element(values.begin(), values.begin() + ptrdiff_t(values.size() / 2), values.end());
+  return values[values.size() / 2];
+}
+
+class ProtectionBank {
+ public:
+  // Moves all modes to a fix, by the way of the body since the last one, and updates them by its matches.
+  void update(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& limits,
+              const SE3& fix, const SE3& body_from_cam, const std::tuple<double, double>& size_px, double base_z_m, double stamp_s,
+              const SE3& way, const Mat6& cov_way) {
+    std::erase_if(modes_, [&](const Mode& m) { return m.group.what < Without::kNothing || stamp_s - m.seen_s > kForgottenS; });
+    for (Mode& mode : modes_) move(mode, way, cov_way);
+    Mode anywhere{{Without::kAllBefore}, fix, {}, stamp_s};
+    for (int a = 0; a < 6; ++a) anywhere.covariance[a][a] = a < 3 ? kAnywhereRad * kAnywhereRad : kAnywhereM * kAnywhereM;
+    Mode before = modes_.empty() ? anywhere : modes_[0];
+    std::map<Group, Sums> groups{{{Without::kNothing}, {}}};
+    std::vector<Sums> matches;
+    Sums all;
+    const Sightings seen = sightings_of(points, pixels, weights);
+    const Refinement refinement = refinement_of(limits);
+    const SE3 map_from_cam = fix * body_from_cam, cam_from_map = inverse(map_from_cam);
+    const auto [width_px, height_px] = size_px;
+    std::vector<double> us, vs, depths;
+    for (size_t n = 0; n < seen.count; ++n) {
+      us.push_back(seen.pixels[n][0]), vs.push_back(seen.pixels[n][1]), depths.push_back((cam_from_map * seen.points[n])[2]);
+      if (!(norm(seen.points[n]) < kFarthest && std::hypot(us[n], vs[n]) < kFarthest && std::isfinite(depths[n])))
+        throw nb::value_error("points, pixels, poses: finite, below 1e7");
+    }
+    if (!(width_px >= 1.0 && height_px >= 1.0)) throw nb::value_error("size_px: from 1");
+    const double middle_u = median(us), middle_v = median(vs), middle_depth = median(depths), square = refinement.width * refinement.width;
+    for (size_t n = 0; n < seen.count; ++n) {
+      const Vec3 point = seen.points[n], pixel = seen.pixels[n], in_cam = cam_from_map * point;
+      const auto [residual, by_point] = residuals_of(in_cam, pixel, seen.weights[n], lens);
+      const double squared = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
+      if (!(in_cam[2] > 0.0 && squared < refinement.gate_squared)) continue;
+      const double robust = square / (square + squared);
+      Sums match, disparity;
+      for (int k = 0; k < 3; ++k) {  // where the body turns and shifts, the point moves against it
+        double row[7];
+        const Vec3 by_map = map_from_cam.rotation * by_point[k];
+        store(cross(by_map, point - fix.translation), row), store(-by_map, row + 3), row[6] = residual[k];
+        (k < 2 ? match : disparity).add(row, robust * robust / kWhite);
+      }
+      groups[{Without::kDisparities}].add(disparity);
+      match.add(disparity), all.add(match), matches.push_back(match);
+      const auto part = [](double at, double size, int count) { return std::clamp(int(std::floor(at / size * count)), 0, count - 1); };
+      const auto tile = [&](int axis, double size_m) { return int(std::floor(point[axis] / size_m)); };
+      groups[{Without::kSide, pixel[0] < middle_u}].add(match), groups[{Without::kHalf, pixel[1] < middle_v}].add(match);
+      groups[{Without::kDepth, in_cam[2] < middle_depth}].add(match), groups[{Without::kHeight, point[2] < base_z_m + kLowM}].add(match);
+      groups[{Without::kImage, part(pixel[0], width_px, kColumns), part(pixel[1], height_px, kRows)}].add(match);
+      groups[{Without::kCell, tile(0, kCellM), tile(1, kCellM)}].add(match);
+      for (int k = 0; k < 4; ++k)  // zones overlap by halves: what one of them can hold, no border cuts
+        groups[{Without::kZone, tile(0, 0.5 * kZoneM) - k / 2, tile(1, 0.5 * kZoneM) - k % 2}].add(match);
+    }
+    const auto updated = [&](Mode& mode, const Sums& left_out) {
+      Sums used = all;
+      used.add(left_out, -1.0);
+      fleetmap::update(mode, fix, used);
+    };
+    for (Mode& mode : modes_) {
+      const auto found = groups.extract(mode.group);
+      if (found) mode.seen_s = stamp_s;
+      updated(mode, found ? found.mapped() : Sums{});
+    }
+    const auto add_mode = [&](const Mode& from, Group group, const Sums& left_out) {
+      modes_.push_back({group, from.map_from_body, from.covariance, stamp_s});
+      updated(modes_.back(), left_out);
+    };
+    for (const auto& [group, left_out] : groups) add_mode(before, group, left_out);  // first seen: all before was without it
+    add_mode(anywhere, anywhere.group, {});
+    add_mode(before, {Without::kFix}, all);
+    for (const Sums& match : matches) add_mode(before, {Without::kMatch}, match);
+  }
+
+  // Levels of position and rotation, metres and radians, of a published pose; way: since the last fix; cov_map: of the map's own error. The
+  // position is that of the body and of a point of it, in its axes. Infinite without a fix.
+  std::tuple<double, double> level(const SE3& map_from_body, const SE3& way, const Mat6& cov_way, const Mat6& cov_map, Vec3 point,
+                                   double risk) const {
+    if (!(risk > 0.0 && risk < 1.0)) throw nb::value_error("risk: above 0, below 1");
+    double level_m = modes_.empty() ? kUnknown : 0.0, level_rad = level_m;
+    std::map<double, double> factors;
+    for (Mode mode : modes_) {
+      const auto [what, column, row] = mode.group;
+      const double share = what == Without::kNothing ? 0.5 * risk : 0.5 * risk / double(modes_.size() - 1) / prior_of(what);
+      if (!factors.contains(share)) factors[share] = factor_of(share);
+      move(mode, way, cov_way);
+      Mat6 total = cov_map;
+      for (int k = 0; k < 36; ++k) total.at[k] += kOverbound * mode.covariance.at[k];
+      for (const Vec3 lever : {Vec3{}, point}) {
+        const Mat6 there = about(total, mode.map_from_body.rotation * lever);
+        const double apart_m = norm(map_from_body * lever - mode.map_from_body * lever);
+        const double turned_rad = norm(so3_log(mode.map_from_body.rotation * transposed(map_from_body.rotation)));
+        const double of_mode_m = apart_m + factors[share] * widest(mat3(there.at + 21, 6));
+        const double of_mode_rad = turned_rad + factors[share] * widest(mat3(there.at, 6));
+        if (!std::isfinite(of_mode_m + of_mode_rad)) return {kUnknown, kUnknown};
+        level_m = std::max(level_m, of_mode_m), level_rad = std::max(level_rad, of_mode_rad);
+      }
+    }
+    return {level_m, level_rad};
+  }
+
+ private:
+  std::vector<Mode> modes_;  // the first one used everything
+};
+
+}  // namespace
+
+void bind_protection(nb::module_& module) {
+  nb::class_<ProtectionBank>(module, "ProtectionBank")
+      .def(nb::init<>())
+      .def("update", &ProtectionBank::update, "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a, "map_from_body"_a,
+           "body_from_cam"_a, "size_px"_a, "base_z_m"_a, "stamp_s"_a, "way"_a, "cov_way"_a)
+      .def("level", &ProtectionBank::level, "map_from_body"_a, "way"_a, "cov_way"_a, "cov_map"_a, "point"_a, "risk"_a);
+}
+
+}  // namespace fleetmap

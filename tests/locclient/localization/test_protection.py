@@ -1,0 +1,114 @@
+"""The protection level: its definition, no errors beyond it under faults, and what must fail without one of its parts."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.stats import chi
+
+from benchmarks.robot.bench_protection import FAULTS, MAP_SIGMAS, RISK, Drive, judged
+from fleetmap import core
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transform_points
+from fleetmap.pnp.pnp import REFINEMENT
+from fleetmap.sensors.rectification import StereoCamera
+from locclient.localization.place import Place, boxplus
+
+CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
+BODY_FROM_CAM = se3(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.2, 0.06, 0.5]))
+
+
+def aisle(frames: int = 60, matches: int = 80) -> Drive:
+    """A drive of half a metre a fix between two racks."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(0, 45, 6000), rng.choice([-1.6, 1.6], 6000), rng.uniform(0.1, 4, 6000)])
+    turns = [so3_exp(np.array([0, 0, 0.1 * np.sin(k / 5)])) for k in range(frames)]
+    map_from_body = np.array([se3(turn, np.array([0.5 * k, 0, 0])) for k, turn in enumerate(turns)])
+    ids = []
+    for placed in map_from_body:
+        in_cam = transform_points(se3_inverse(placed @ BODY_FROM_CAM), points)
+        pixels = CAMERA.pixel_from_point(np.maximum(in_cam, [-1e9, -1e9, 0.1]))
+        inside = (in_cam[:, 2] > 1) & (in_cam[:, 2] < 12) & (abs(pixels[:, :2] - (320, 240)) < (315, 235)).all(axis=1)
+        ids.append(np.flatnonzero(inside)[:matches].astype(np.uint64))
+    return Drive(map_from_body, ids, [points[i] for i in ids], [np.zeros(len(i)) for i in ids], CAMERA, BODY_FROM_CAM)
+
+
+def residuals(map_from_body: Array, points: Array, pixels: Array) -> Array:
+    """(K, 3) of u, v and the disparity, zero where that is unknown."""
+    off = CAMERA.pixel_from_point(transform_points(se3_inverse(map_from_body @ BODY_FROM_CAM), points)) - pixels
+    return np.nan_to_num(np.column_stack([off[:, :2], off[:, 0] - off[:, 2]]))
+
+
+def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
+    rng, drive = np.random.default_rng(2), aisle(1, 30)
+    fix, points = boxplus(drive.map_from_body[0], rng.normal(0.0, 0.004, 6)), drive.points_map[0]
+    in_cam = transform_points(se3_inverse(drive.map_from_body[0] @ BODY_FROM_CAM), points)
+    pixels = CAMERA.pixel_from_point(in_cam) + rng.normal(0.0, 1.0, points.shape)
+    pixels[::4, 2] = np.nan
+    bank, still = core.ProtectionBank(), (np.eye(4), np.zeros((6, 6)))
+    given = np.ones((len(points), 2)), CAMERA.lens, REFINEMENT, fix, BODY_FROM_CAM, (640, 480), 0.0, 0.0, *still
+    assert bank.level(fix, *still, np.eye(6), np.zeros(3), RISK) == (np.inf, np.inf)
+    bank.update(points, pixels, *given)
+
+    off, step = residuals(fix, points, pixels), 1e-6 * np.eye(6)
+    sides = [[residuals(boxplus(fix, sign * row), points, pixels) for sign in (1, -1)] for row in step]
+    jacobian = np.moveaxis(np.array([(up - down) / 2e-6 for up, down in sides]), 0, 2)  # (K, 3, 6)
+    squared = (off**2).sum(axis=1)
+    weight = (squared < REFINEMENT[1]) * (16 / (16 + squared)) ** 2 / 1.6
+    ends = [np.sort(values)[len(values) // 2] for values in (pixels[:, 0], pixels[:, 1], in_cam[:, 2])]
+    halves = [pixels[:, 0] < ends[0], pixels[:, 1] < ends[1], in_cam[:, 2] < ends[2], points[:, 2] < 1.0]
+    out: list[tuple[float, Array]] = [(1e-3, side) for half in halves for side in (half, ~half)]
+    parts = [np.floor(points[:, :2] / 2), np.floor(pixels[:, :2] / 160), np.eye(len(points))]
+    out += [(1e-2, (cells == cell).all(axis=1)) for cells in parts for cell in np.unique(cells, axis=0)]
+    corner = np.floor(points[:, :2] / 4)
+    zones = np.unique([row - shift for row in corner for shift in product((0, 1), repeat=2)], axis=0)
+    out += [(1e-3, np.isin(corner - zone, (0, 1)).all(axis=1)) for zone in zones]
+    kept = [(prior, ~mask[:, None] & np.ones(3, bool)) for prior, mask in out if (mask & (weight > 0)).any()]
+    kept += [(1e-3, np.tile([True, True, False], (len(points), 1))), (1e-3, np.ones((len(points), 3), bool))]
+    kept += [(1e-3, np.zeros((len(points), 3), bool)), (RISK / 2, np.ones((len(points), 3), bool))]
+
+    way, at = Place(se3(so3_exp(np.array([0, 0, 0.1])), np.array([0.5, 0, 0])), 1e-6 * np.eye(6)), np.array([0, 0.2, 1])
+    levels = []
+    for prior, mask in kept:
+        weights = (weight[:, None] * mask).ravel()
+        information = np.diag([1.0] * 3 + [1 / 900] * 3) + jacobian.reshape(-1, 6).T * weights @ jacobian.reshape(-1, 6)
+        moved = -np.linalg.solve(information, jacobian.reshape(-1, 6).T @ (weights * off.ravel()))
+        here = Place(boxplus(fix, moved), np.linalg.inv(information)).at_end_of(way)
+        there = Place(here.map_from_body, 1.56 * here.cov_rot_trans + np.diag(MAP_SIGMAS**2)).of_point(
+            se3(np.eye(3), at)
+        )
+        factor = chi(3).isf(1 if prior == RISK / 2 else RISK / 2 / (len(kept) - 1) / prior)
+        factor = chi(3).isf(RISK / 2) if prior == RISK / 2 else factor
+        apart = there.map_from_body @ se3_inverse(fix @ way.map_from_body @ se3(np.eye(3), at))
+        shift_m = there.position_m - (fix @ way.map_from_body @ se3(np.eye(3), at))[:3, 3]
+        sigmas = [np.sqrt(np.linalg.eigvalsh(there.cov_rot_trans[k : k + 3, k : k + 3])[-1]) for k in (3, 0)]
+        both = np.linalg.norm(shift_m), np.linalg.norm(so3_log(apart[:3, :3]))
+        levels.append([size + factor * sigma for size, sigma in zip(both, sigmas, strict=True)])
+    level = bank.level(fix @ way.map_from_body, *way[:2], np.diag(MAP_SIGMAS**2), at.astype(float), RISK)
+    assert level == pytest.approx(np.max(levels, axis=0), rel=1e-6)
+
+
+@pytest.mark.parametrize("fault", [fault for fault, (prior, *_) in FAULTS.items() if prior])
+def test_no_error_is_beyond_its_level(fault: str) -> None:
+    drive = aisle()
+    for number, size in enumerate(FAULTS[fault][1]):
+        error_m, level_m, error_rad, level_rad = judged(drive, np.random.default_rng(number), fault, size).T
+        assert (error_m < level_m).all() and (error_rad < level_rad).all()
+        if fault == "none":
+            assert len(error_m) > 80 and np.median(level_m) < 0.15 and np.median(error_m / level_m) > 0.05
+
+
+def test_a_level_without_one_of_its_parts_does_not_hold() -> None:
+    sigmas = np.repeat([0.006, 0.02], 3)
+
+    def beyond(risk: float, map_sigmas: Array) -> float:
+        """Share of errors beyond the level where the map's error is five of its sigmas: as rare as the risk."""
+        shift = "the whole map (excluded)"
+        rows = judged(aisle(40), np.random.default_rng(1), shift, 0.1, risk, map_sigmas, bend_m=0.0)
+        return float(np.mean(rows[:, 0] > rows[:, 1]))
+
+    assert beyond(RISK, sigmas) == 0.0
+    assert beyond(1e-2, sigmas) > 0.5  # the factor of another risk
+    assert beyond(RISK, 1e-3 * sigmas) > 0.5  # without the map's own error
+    level_m = judged(aisle(), np.random.default_rng(0), "none", 0.0)[:, 1]
+    error_m = judged(aisle(), np.random.default_rng(0), "near half", 0.1)[:, 0]
+    assert error_m.max() > 1.2 * np.median(level_m)  # K sigma alone, without the separation of the modes
