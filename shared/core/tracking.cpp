@@ -83,20 +83,28 @@ class Tracker {
  public:
   Tracker(const TrackerModel& model, int64_t first_id) : model_(model), next_id_(first_id) {
     const size_t most = model.max_points;
-    for (auto* each : {&pixels_, &points_cam_, &seen_.points, &seen_.pixels, &inliers_.points, &inliers_.pixels}) each->reserve(most);
+    for (auto* each : {&pixels_, &pixels_before_, &points_cam_, &seen_.points, &seen_.pixels, &inliers_.points, &inliers_.pixels})
+      each->reserve(most);
     for (auto* each : {&starts_, &places_, &back_, &squared_, &left_px_, &prior_px_, &disparities_px_}) each->reserve(2 * most);
-    seen_.weights.reserve(most), inliers_.weights.reserve(most), ids_.reserve(most), kept_.reserve(most), taken_.reserve(most);
+    seen_.weights.reserve(most), inliers_.weights.reserve(most), ids_.reserve(most), ids_before_.reserve(most), kept_.reserve(most),
+        taken_.reserve(most);
   }
 
   // Tracks the points into the next frame, by flow there and back from their predicted pixels: those without depth move as if they
   // were far away, those that would come to lie behind the camera stay. The motion is refined by the points with depth, which must agree
   // with it then. points_cam (N,): the points, if not given by the disparities (no pointer: by these). is_predicted: the motion
   // is not a mere guess. Then one level above the image is enough, coarser ones cost as much again and mix near and far points; where
-  // too few points are found, the prediction was wrong, and all levels are used.
-  TrackedMotion follow(GreyImage image, const SE3& cam_from_previous, bool is_predicted, const Vec3* points_cam) {
+  // too few points are found, the prediction was wrong, and all levels are used. again: the image is that of the last call, whose result
+  // is forgotten.
+  TrackedMotion follow(GreyImage image, const SE3& cam_from_previous, bool is_predicted, const Vec3* points_cam, bool again) {
     TrackedMotion found;
-    std::swap(before_, now_);
-    now_.set(image);
+    if (again) {
+      ids_ = ids_before_, pixels_ = pixels_before_;
+    } else {
+      ids_before_ = ids_, pixels_before_ = pixels_;
+      std::swap(before_, now_);
+      now_.set(image);
+    }
     const size_t count = ids_.size();
     if (count == 0) return found;
     points_cam_.clear();
@@ -162,7 +170,7 @@ class Tracker {
   }
 
   const TrackerModel& model() const { return model_; }
-  const std::vector<int64_t>& ids() const { return ids_; }
+  const std::vector<int64_t>& ids(bool before = false) const { return before ? ids_before_ : ids_; }
   const std::vector<Vec3>& pixels() const { return pixels_; }
 
  private:
@@ -265,8 +273,8 @@ class Tracker {
   }
 
   TrackerModel model_;
-  std::vector<int64_t> ids_;
-  std::vector<Vec3> pixels_;
+  std::vector<int64_t> ids_, ids_before_;  // before: in the image before the newest
+  std::vector<Vec3> pixels_, pixels_before_;
   int64_t next_id_;
   Pyramid before_, now_;
   CornerFinder corners_;
@@ -340,7 +348,7 @@ using RightAndHalves = std::tuple<Image, Image, Image>;
 
 auto track(SharedTracker& tracker, const Image& left, const std::optional<RightAndHalves>& pair,
            const std::optional<Array<float, -1, -1>>& disparity_px, const std::optional<SE3>& cam_from_previous, bool is_predicted,
-           const std::optional<Points>& points_cam, const std::optional<Image>& clearance_px) {
+           const std::optional<Points>& points_cam, const std::optional<Image>& clearance_px, bool again) {
   const GreyImage image = pictured(left);
   if (clearance_px && !same_size(left, *clearance_px)) throw nb::value_error("clearance_px: of the image's size");
   TrackerFrame frame{{image, {}}, {}, {}, clearance(clearance_px)};
@@ -351,12 +359,13 @@ auto track(SharedTracker& tracker, const Image& left, const std::optional<RightA
   }
   if (disparity_px && !same_size(left, *disparity_px)) throw nb::value_error("disparity_px: of the image's size");
   if (disparity_px) frame.disparity_px = *disparity_px;
-  if (points_cam) check_rows(tracker.ids().size(), "points_cam: one for each point", *points_cam);
+  if (points_cam) check_rows(tracker.ids(again).size(), "points_cam: one for each point", *points_cam);
   if (cam_from_previous && !tracker.has_begun()) throw nb::value_error("cam_from_previous: there is none, begin with a frame");
   check_corners(tracker.model().corners.distance, double(image.width), double(image.height));
   TrackedMotion found;
   unlocked([&] {
-    if (cam_from_previous) found = tracker.follow(image, *cam_from_previous, is_predicted, points_cam ? points_cam->rows() : nullptr);
+    if (cam_from_previous)
+      found = tracker.follow(image, *cam_from_previous, is_predicted, points_cam ? points_cam->rows() : nullptr, again);
     tracker.renew(frame);
   });
   std::optional<std::tuple<SE3, Mat6>> motion;
@@ -392,7 +401,7 @@ void bind_tracking(nb::module_& module) {
            "left"_a)
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.rows(), of.shape(0)); }), "pixels"_a)
       .def("track", in_turn(&track), "left"_a, "pair"_a, "disparity_px"_a, "cam_from_previous"_a, "is_predicted"_a, "points_cam"_a,
-           "clearance_px"_a = nb::none())
+           "clearance_px"_a = nb::none(), "again"_a = false)
       .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return tracker.ids(); }))
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return tracker.pixels(); }));
   module.def("is_image_still", &is_image_still, "old_ids"_a, "old_pixels"_a, "ids"_a, "pixels"_a, "limit_px"_a);

@@ -521,6 +521,7 @@ class Tracker:
         is_predicted: bool,
         points_cam: _Reals | None,
         clearance_px: _Grey | None = None,
+        again: bool = False,  # the frame of the last call, from the points before that
     ) -> tuple[tuple[_Reals, _Reals] | None, float]:
         """Track the points into a frame, predicted by a motion (None: they belong to the frame), measure disparities, add corners.
 

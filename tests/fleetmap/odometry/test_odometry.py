@@ -352,6 +352,25 @@ def test_a_prediction_may_be_wrong() -> None:
     assert min(held) > 0.9 * max(held)
 
 
+def test_a_guess_beyond_the_flow_is_mended_by_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points come to lie 100 px from where a guess has them: flow finds edges there that agree on another motion."""
+    step = se3_inverse(se3_inverse(BODY_FROM_CAM) @ truth_between(FRAME_NS, 2 * FRAME_NS) @ BODY_FROM_CAM)
+    turned = np.eye(4)
+    turned[:3, :3] = so3_exp(np.array([0.0, 100.0 / CAMERA.focal_px, 0.0]))
+    described, motions = [], [step, turned @ step]
+    remember = Tracker._remember
+    monkeypatch.setattr(Tracker, "_remember", lambda *of: described.append(of[-1]) or remember(*of))  # type: ignore[func-returns-value]
+    for number, guess in enumerate(motions):
+        tracker = Tracker(CAMERA, TrackerSettings())
+        first = tracker.track(stereo_frame(FRAME_NS), lambda _: None)
+        tracked = tracker.track(stereo_frame(2 * FRAME_NS), lambda _, guess=guess: guess)
+        assert len(described) == 2 * number, "costs nothing where the flow holds"
+        assert np.isin(first.ids, tracked.ids).mean() > 0.7
+        assert tracked.cam_from_previous is not None
+        assert not tracked.by_descriptors
+        assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
+
+
 def test_a_filter_that_is_wrong_at_once_goes_on_from_the_last_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not from where its start was valid, which may be long before the frame that it was found at."""
 

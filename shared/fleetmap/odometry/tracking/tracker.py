@@ -19,6 +19,8 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 Ids = NDArray[np.int64]
 MotionSince = Callable[[int], Array | None]
+# Of the points, that the flow must hold from a mere guess: below it descriptors say where to look, and the better result of both counts.
+_HELD_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,18 +121,25 @@ class Tracker:
             motion = next((e.cam_from_earlier for e in earlier if e.frame_index == self._frame_index - 1), None)
             self._step(frame)
             return Tracked(self._points.ids, self._points.pixels, earlier, motion, share, by_descriptors=True)
-        self._memory.clear()
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
-        guess, before, points_cam = np.eye(4) if guess is None else guess, None, None
+        guess, before, points_cam = np.eye(4) if guess is None else guess, self._points.ids, None
         if self._points_in_camera is not None:
-            before = self._points.ids
             points_cam = self._points_in_camera(before)
             points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
         solved, share = self._step(frame, guess, is_predicted, points_cam)
+        held = np.isin(before, self._points.ids).sum()
+        if is_predicted or not self._camera.baseline_m or (solved and held >= _HELD_SHARE * len(before)):
+            self._memory.clear()
+        elif (seen := self._described_motion(previous, frame)) is not None:
+            # The points left the flow's reach: the guess was wrong. Those that it found instead may agree on a slide along edges.
+            retried = self._step(frame, seen, again=True)
+            if retried[0] is None or (solved and np.isin(before, self._points.ids).sum() <= held):
+                retried = self._step(frame, guess, again=True)
+            solved, share = retried
         motion, information = solved or (None, None)
         ids, pixels = self._points.ids, self._points.pixels
-        if motion is None and before is not None:
+        if motion is None and points_cam is not None:
             # Without parallax none of the tracked points can be triangulated: they suffice to continue.
             motion = guess if np.isin(ids, before).sum() >= self._settings.min_inliers else None
         return Tracked(ids, pixels, (), motion, share, by_descriptors=False, information=information)
@@ -146,11 +155,19 @@ class Tracker:
         cam_from_previous: Array | None = None,
         is_predicted: bool = False,
         points_cam: Array | None = None,
+        again: bool = False,
     ) -> tuple[tuple[Array, Array] | None, float]:
         pair = None if frame.right is None else (frame.right, frame.half_left, frame.half_right)
         guess = None if cam_from_previous is None else np.ascontiguousarray(cam_from_previous)
         images = frame.left, pair, frame.disparity_px
-        return self._points.track(*images, guess, is_predicted, points_cam, self._camera.clearance_px)
+        return self._points.track(*images, guess, is_predicted, points_cam, self._camera.clearance_px, again)
+
+    def _described_motion(self, previous: RectifiedFrame, frame: RectifiedFrame) -> Array | None:
+        """Return cam_from_previous (4, 4) by descriptors, None if too few agree."""
+        earlier, current = self._remembered(previous, frame)
+        every = np.arange(len(current.features))
+        found = self._matched(earlier[-1], current, every, None, None)[2]
+        return None if found is None else found.cam_from_source
 
     def _rematch(
         self,
@@ -163,18 +180,22 @@ class Tracker:
 
         The matches with each frame are verified by one rigid motion.
         """
-        if not self._memory or self._memory[-1].frame_index != self._frame_index - 1:
-            self._memory.append(self._remember(previous, self._frame_index - 1))
-        current = self._remember(frame, self._frame_index)
+        remembered, current = self._remembered(previous, frame)
         found = []
         free = np.ones(len(current.features), bool)
-        for old in reversed(self._memory):
+        for old in reversed(remembered):
             matched = self._match_pair(old, current, free, motion_since(old.frame_index), rotation_sigma_rad)
             if matched is not None:
                 found.append(matched)
-        self._memory = [*self._memory[-(self._settings.memory_frames - 1) :], current]
         share = sum(len(e.ids) for e in found) / max(len(current.features), 1)
         return tuple(sorted(found, key=lambda e: -len(e.ids))), share
+
+    def _remembered(self, previous: RectifiedFrame, frame: RectifiedFrame) -> tuple[list[_Remembered], _Remembered]:
+        """Return the last few frames that were not followed, with the one before them, and the current frame."""
+        earlier = self._memory or [self._remember(previous, self._frame_index - 1)]
+        current = self._remember(frame, self._frame_index)
+        self._memory = [*earlier[-(self._settings.memory_frames - 1) :], current]
+        return earlier, current
 
     def _remember(self, frame: RectifiedFrame, frame_index: int) -> _Remembered:
         features = extract(frame.left, self._orb, self._camera.clearance_px)
@@ -191,12 +212,7 @@ class Tracker:
         rotation_sigma_rad: float | None,
     ) -> Earlier | None:
         """Match with one earlier frame; adds the tracks to the current points and removes them from `free`."""
-        usable = np.flatnonzero(free)
-        known = np.flatnonzero(np.isfinite(old.disparities))
-        pairs = match_mutual(old.features.descriptors[known], current.features.descriptors[usable], 70, 0.85)
-        a, b = known[pairs[:, 0]], usable[pairs[:, 1]]
-        measured = np.column_stack([current.features.pixels[b], current.features.pixels[b, 0] - current.disparities[b]])
-        found = self._wide_motion(old.points_cam[a], measured, guess, rotation_sigma_rad)
+        a, b, found = self._matched(old, current, np.flatnonzero(free), guess, rotation_sigma_rad)
         if found is None:
             return None
         a, b = a[found.inliers], b[found.inliers]
@@ -213,6 +229,21 @@ class Tracker:
         ids = self._points.add(fresh) + np.arange(len(fresh))
         earlier = np.column_stack([old.features.pixels[a], old.features.pixels[a, 0] - old.disparities[a]])
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
+
+    def _matched(
+        self,
+        old: _Remembered,
+        current: _Remembered,
+        usable: Ids,
+        guess: Array | None,
+        rotation_sigma_rad: float | None,
+    ) -> tuple[Ids, Ids, PnpResult | None]:
+        """Return matches of old features (M,) with usable current ones (M,), and the motion that explains them."""
+        known = np.flatnonzero(np.isfinite(old.disparities))
+        pairs = match_mutual(old.features.descriptors[known], current.features.descriptors[usable], 70, 0.85)
+        a, b = known[pairs[:, 0]], usable[pairs[:, 1]]
+        measured = np.column_stack([current.features.pixels[b], current.features.pixels[b, 0] - current.disparities[b]])
+        return a, b, self._wide_motion(old.points_cam[a], measured, guess, rotation_sigma_rad)
 
     def _wide_motion(
         self, points_cam: Array, measured: Array, guess: Array | None, rotation_sigma_rad: float | None
