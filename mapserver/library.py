@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import StateError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from fleetmap.mapformat.names import check_name
@@ -91,7 +91,10 @@ def build_map(
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     options = options or BuildOptions()
     paths = (recordings,) if isinstance(recordings, str | Path) else recordings
+    if not paths:
+        raise UsageError("build_map: no recording is given; name one or more")
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
+    _need_gtsam()
     is_chosen = options.settings is not None or options.use is not None
     with nullcontext() if is_chosen else open_recording(request.recordings[0], options.opening) as first:
         request = replace(request, first=first)
@@ -99,13 +102,15 @@ def build_map(
     return BuiltMap(draft.version, draft.sentence, draft.report, draft.left_out, request.store, site, built)
 
 
-def settings_for(request: BuildRequest) -> SurveySettings:
-    """Return the survey settings of the request: its own, or the preset of the first recording's sensors, overridden by its file.
-
-    ModuleNotFoundError without gtsam, before a build that would end at its first loop.
-    """
+def _need_gtsam() -> None:
+    """Raise ModuleNotFoundError without gtsam, before a build that would end at its first loop."""
     if find_spec("gtsam") is None:
         raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
+
+
+def settings_for(request: BuildRequest) -> SurveySettings:
+    """Return the survey settings of the request: its own, or the preset of the first recording's sensors, overridden by its file."""
+    _need_gtsam()
     options, first = request.options, request.first
     if options.settings is not None:
         return options.settings

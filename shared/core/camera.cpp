@@ -3,6 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <vector>
 
 namespace fleetmap {
 namespace {
@@ -11,6 +13,9 @@ constexpr int kIterations = 12;
 constexpr double kStep = 1e-6, kMissed = 1e-7;
 constexpr double kNearest = 1e-9;
 constexpr double kLargestAngle = 3.1;  // of equidistant lenses: straight back has no pixel
+
+// A lens without distortion.
+struct Straight {};
 
 // Radial-tangential distortion k1 k2 p1 p2 k3 k4 k5 k6. Sources: Brown 1966; OpenCV's order and its rational model.
 struct RadialTangential {
@@ -38,6 +43,11 @@ std::pair<double, double> distorted(const RadialTangential& lens, double x, doub
 }
 
 // True if the lens sees a point in front of it; its distorted position in the plane z = 1.
+bool is_seen(const Straight&, double reach, Vec3 point, double* image) {
+  const double x = image[0] = point[0] / point[2], y = image[1] = point[1] / point[2];
+  return point[2] > kNearest && x * x + y * y < reach;
+}
+
 bool is_seen(const RadialTangential& lens, double reach, Vec3 point, double* image) {
   const double x = point[0] / point[2], y = point[1] / point[2];
   std::tie(image[0], image[1]) = distorted(lens, x, y);
@@ -94,7 +104,9 @@ auto undistort(const Array<double, 8>& coefficients, double reach, const Reals& 
 template <typename Use>
 void with_lens(const Reals& lens, const Use& use) {
   const size_t size = lens.shape(0);
-  if (size == 8)
+  if (size == 8 && std::all_of(lens.data(), lens.data() + 8, [](double k) { return k == 0.0; }))
+    use(Straight{});
+  else if (size == 8)
     use(RadialTangential(lens.data()));
   else if (size == 12)
     use(Sphere{RadialTangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
@@ -130,6 +142,9 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
   const size_t count = depth.size();
   check_rows(count, "rays: one for each pixel of depth", rays);
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
+  // Each point in the pixel at its upper left; a row and a column more are before the image.
+  const size_t columns = size_t(width) + 1;
+  std::vector<float> nearest(columns * (size_t(height) + 1), std::numeric_limits<float>::infinity());
   auto colour = zeros<float>(size_t(width) * size_t(height));
   with_lens(lens, [&](const auto& coefficients) {
     unlocked([&] {
@@ -141,14 +156,17 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
         if (!(point[2] > kNearest && is_seen(coefficients, reach, point, image))) continue;
         const double u = intrinsics(0) * image[0] + intrinsics(2), v = intrinsics(1) * image[1] + intrinsics(3);
         if (!(-1.0 <= u && u < double(width) && -1.0 <= v && v < double(height))) continue;
-        const int left = int(std::floor(u)), top = int(std::floor(v));
-        for (int row = std::max(top, 0); row < std::min(top + 2, height); ++row)
-          for (int column = std::max(left, 0); column < std::min(left + 2, width); ++column) {
-            float& held = colour[size_t(row) * size_t(width) + size_t(column)];
-            const float found = float(point[2]);
-            if (held == 0.0f || found < held) held = found;
-          }
+        const int column = int(u) + int(u >= 0.0), row = int(v) + int(v >= 0.0);
+        float& held = nearest[size_t(row) * columns + size_t(column)];
+        held = std::min(held, float(point[2]));
       }
+      for (size_t row = 0; row < size_t(height); ++row)
+        for (size_t column = 0; column < size_t(width); ++column) {
+          const float* above = &nearest[row * columns + column];
+          const float* below = above + columns;
+          const float found = std::min(std::min(above[0], above[1]), std::min(below[0], below[1]));
+          colour[row * size_t(width) + column] = found < std::numeric_limits<float>::infinity() ? found : 0.0f;
+        }
     });
   });
   return as_numpy<float, 2>(std::move(colour), {size_t(height), size_t(width)});

@@ -9,7 +9,7 @@ namespace fleetmap {
 namespace {
 
 // Of every n-th row: every n-th pixel, their mean, standard deviation and share of those at least as bright as the limit; and the variance
-// of the steps from pixel to pixel.
+// of the steps from pixel to pixel. Of nothing each is 0.
 auto brightness(const Image& image, int every, int bright) {
   if (every < 1) throw nb::value_error("every: at least 1");
   const size_t step = size_t(every), height = (image.shape(0) + step - 1) / step, width = (image.shape(1) + step - 1) / step;
@@ -33,7 +33,7 @@ auto brightness(const Image& image, int every, int bright) {
       if (from.width > 0) steps += from.width - 1, steps_total += int32_t(row[from.width - 1]) - int32_t(row[0]);
     }
   });
-  const auto share = [](int64_t of, int64_t count) { return double(of) / double(count); };
+  const auto share = [](int64_t of, int64_t count) { return count > 0 ? double(of) / double(count) : 0.0; };
   const auto variance = [&](int64_t of_squares, int64_t sum, int64_t count) {
     return share(of_squares, count) - share(sum, count) * share(sum, count);
   };

@@ -42,6 +42,8 @@ def test_a_map_in_five_lines(room_ride: Path, tmp_path: Path) -> None:
 def test_a_wrong_site_name_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="site name"):
         build_map([tmp_path / "nowhere"], tmp_path / "maps", "Hall 1")
+    with pytest.raises(UsageError, match="no recording"):
+        build_map([], tmp_path / "maps", "hall")
 
 
 def test_missing_libraries_are_named_with_the_extra_that_has_them() -> None:

@@ -6,16 +6,30 @@ folder) and serve again. CPU times are the process's, as they are and as the mac
 """
 
 import json
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
-from benchmarks.common.recorded_runs import Options, Results, benchmark, played, recorded, resident_mb, surveyed
+from benchmarks.common.recorded_runs import (
+    SITE,
+    Options,
+    Results,
+    benchmark,
+    played,
+    recorded,
+    resident_mb,
+    surveyed,
+    tool,
+)
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.free_memory import give_back_free_memory
+from fleetmap.messages import Status, robot_key
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
@@ -30,7 +44,10 @@ CASES: dict[str, tuple[str, ...]] = {
     "night, stock three days on": ("--robot", "runner-1", "--day", "3", "--light", "night"),
     "camera 0.5 m lower": ("--robot", "tote-1", "--day", "1"),
     "opposite direction": ("--robot", "opposite-1", "--day", "1"),
+    "another site": ("--robot", "runner-1", "--day", "1", "--seed", "1"),
 }
+_PROCESS = "process"
+_UNSURE = (Status.LOST, Status.AMBIGUOUS)
 
 
 def odometry_ms(path: Path) -> list[float]:
@@ -54,6 +71,7 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
     """What a run was worth, flat."""
     errors, angles, cpu = run_metrics.error_m(frames), run_metrics.error_deg(frames), run_metrics.frame_ms(frames)
     outside = [run_metrics.is_outside_its_bound(frame) for frame in frames if frame.error_map_m is not None]
+    unsure = [1e3 * frame.cpu_s for frame in frames[run_metrics.WARM_UP_FRAMES :] if frame.status in _UNSURE]
     return {
         "frames": len(frames),
         "first_fix_frame": run_metrics.first_fix(frames),
@@ -68,6 +86,7 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
         "truth_outside_share": float(np.mean(outside)) if outside else None,
         "cpu_mean_ms": None if cpu is None else cpu["mean"],
         "cpu_p99_ms": None if cpu is None else cpu["p99"],
+        "unsure_p99_ms": float(np.percentile(unsure, 99)) if unsure else None,
         "rss_mb": resident_mb()["resident"],
         "rss_anonymous_mb": resident_mb()["anonymous"],
         "stage_ms": run_metrics.stage_ms(frames),
@@ -75,9 +94,30 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
     }
 
 
-@benchmark(CASES)
+def process_figures(recording: Path, store: Path) -> dict[str, float]:
+    """Of `locclient run` at the recording's own pace: CPU seconds from its start to the first estimate that it publishes, and the most MB in
+    memory."""
+    first_s, rss_mb = list[float](), list[float]()
+    with tempfile.TemporaryDirectory() as folder, Bus("tcp/127.0.0.1:0", is_server=True).open() as bus:
+        config = Path(folder) / "robot.toml"
+        config.write_text(
+            f'[run]\nstore = "{store}"\nsite = "{SITE}"\nrobot = "bench"\ncache = "{folder}"\noutbox = "{folder}/spool.sqlite3"\n'
+            f'[source]\nkind = "recording"\nrecording = "{recording}"\nspeed = 1.0\n[output]\nendpoint = "{bus.endpoint}"\n'
+        )
+        with psutil.Popen([*tool("locclient"), "run", "--config", str(config)]) as process:
+            bus.subscribe(robot_key(SITE, "bench", "estimate"), lambda *_: first_s.append(sum(process.cpu_times()[:2])))
+            while process.poll() is None:
+                rss_mb.append(process.memory_info().rss / 1e6)
+                time.sleep(0.5)
+    return {"first_estimate_cpu_s": first_s[0], "rss_mb": max(rss_mb)}
+
+
+@benchmark([*CASES, _PROCESS])
 def main(arguments: Options) -> Results:
     store, found = surveyed(arguments.work), {}
+    if _PROCESS in arguments.only:
+        arguments.only.remove(_PROCESS)
+        found[_PROCESS] = process_figures(recorded(arguments.work, CASES["next day"]), store)
     for name in arguments.only:
         recording = recorded(arguments.work, CASES[name])
         played(recording, store, ":60")

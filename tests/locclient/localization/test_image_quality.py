@@ -83,3 +83,5 @@ def test_figures_are_those_of_numpy() -> None:
     assert thinned == seen[::8, ::8].tobytes()
     kept, steps = seen[::8, ::8], np.diff(seen[::8].astype(np.int64), axis=1)
     assert figures == pytest.approx([kept.mean(), kept.std(), (kept >= 250).mean(), steps.var()], rel=1e-12)
+    for shape in ((0, 0), (0, 5), (5, 0)):
+        assert core.brightness(np.zeros(shape, np.uint8), 8, 250) == (b"", 0.0, 0.0, 0.0, 0.0)

@@ -187,7 +187,7 @@ def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path, m
         assert isinstance(error, kind)
         assert said in str(error)
     monkeypatch.setattr("mapserver.library.find_spec", lambda _: None)
-    assert "gtsam" in str(invoke(app, "build", drive, *to_store).exception)
+    assert "gtsam" in str(invoke(app, "build", tmp_path / "nothing", *to_store).exception), "before a recording is read"
     assert not (tmp_path / "store").exists()
 
 
