@@ -104,7 +104,7 @@ class MappedImageStore(ImageStore, AbstractContextManager["MappedImageStore"]):
             if len(self._segments) % _SEGMENTS_HELD == 0:
                 self._leave_memory()
         kept = np.frombuffer(self._segments[-1], data.dtype, data.size, self._used).reshape(data.shape)
-        kept[...] = data
+        os.pwrite(self._file.fileno(), data.data, self._size - len(self._segments[-1]) + self._used)  # no fault a page
         self._used += -(-data.nbytes // _ALIGNED_BYTES) * _ALIGNED_BYTES
         return kept
 

@@ -95,8 +95,7 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
 
 
 def process_figures(recording: Path, store: Path) -> dict[str, float]:
-    """Of `locclient run` at the recording's own pace: CPU seconds from its start to the first estimate that it publishes, and the most MB in
-    memory."""
+    """Of `locclient run` at the recording's own pace: CPU seconds until it publishes its first estimate, and the most MB in memory."""
     first_s, rss_mb = list[float](), list[float]()
     with tempfile.TemporaryDirectory() as folder, Bus("tcp/127.0.0.1:0", is_server=True).open() as bus:
         config = Path(folder) / "robot.toml"
