@@ -186,7 +186,7 @@ class LoopCloser:
         # A loop where the pose is known would add no information; the global adjustment matches what both see anyway.
         near = np.flatnonzero(reachable & (unlinked | ~known)).tolist()
         chosen = [n for n in near if self._config.zones.compatible(here_m, places_m[n])]
-        far = np.setdiff1d(np.flatnonzero(~reachable), beyond).tolist()
+        far = sorted({*np.flatnonzero(~reachable).tolist()} - {*beyond})
         for refused, reason in ((far, _FAR), (sorted({*near} - {*chosen}), "in different zones")):
             if refused:
                 first, *others = bodies[refused].tolist()

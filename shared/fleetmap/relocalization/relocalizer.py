@@ -177,24 +177,26 @@ class Relocalizer:
         """
         settings = self._settings.fix
         fixes = [fix for k, fix in enumerate(found) if _is_new(fix, found[:k])]
-        tried: list[Array] = []
+        map_from_cam = self.view.map_from_cam
+        at_fixes = sum((_at_place(map_from_cam, fix.map_from_cam) for fix in fixes), np.zeros(len(map_from_cam), int))
+        trials, count = _TRIALS_AT_A_PLACE * at_fixes, 0  # at each place, its neighbourhood's too
         failed = [] if failed is None else failed
         max_trials = settings.top_places_found if fixes else settings.top_places
         for place in self._ranked(query, allowed, failed):
-            map_from_place = self.view.map_from_cam[place]
-            is_known = _count_at([fix.map_from_cam for fix in fixes], map_from_place) > 0
-            if is_known or _count_at(tried, map_from_place) >= _TRIALS_AT_A_PLACE:
+            if trials[place] >= _TRIALS_AT_A_PLACE:
                 continue
-            if len(tried) >= max_trials:
+            if count >= max_trials:
                 break
-            if tried:
+            if count:
                 yield
-            tried.append(map_from_place)
+            count += 1
+            trials += _at_place(map_from_cam, map_from_cam[place])
             fix = self.at_place(query, int(place), map_from_cam_rotation)
             if fix is None:
-                failed.append(map_from_place)
+                failed.append(map_from_cam[place])
             elif _is_new(fix, fixes):
                 fixes.append(fix)
+                trials += _TRIALS_AT_A_PLACE * _at_place(map_from_cam, fix.map_from_cam)
         fixes.sort(key=lambda f: -f.inliers)
         if fixes:
             yield
@@ -257,7 +259,7 @@ class Relocalizer:
         if not failed:
             return most_similar(similarities, allowed, top)
         map_from_cam = self.view.map_from_cam
-        around = [places_around(map_from_cam, place, SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
+        around = [_at_place(map_from_cam, place) for place in failed]
         is_tried = np.any([(map_from_cam == place).all(axis=(1, 2)) for place in failed], axis=0)
         is_open = ~is_tried & (np.sum(around, axis=0) < _TRIALS_AT_A_PLACE)
         is_wanted = is_open if allowed is None else allowed & is_open
@@ -313,7 +315,7 @@ class Relocalizer:
         aliases = yield from self.aliases_of(query, best)
         fixes = [replace(best, alias_ratio=max((a.alias_ratio for a in aliases), default=0.0)), *fixes[1:]]
         for alias in aliases:
-            if _count_at([fix.map_from_cam for fix in fixes], alias.map_from_cam):
+            if any(_at_place(fix.map_from_cam[None], alias.map_from_cam).any() for fix in fixes):
                 continue
             yield
             fix = self.at_alias(query, alias, best)
@@ -389,11 +391,9 @@ def _sigmas(cov_rot_trans: Array) -> tuple[float, float]:
     return float(rotation), float(position)
 
 
-def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:
-    """Number of places with mostly the same neighbourhood as a camera."""
-    if not places:
-        return 0
-    return int(places_around(np.stack(places), map_from_cam, SAME_PLACE_M, _SAME_PLACE_COSINE).sum())
+def _at_place(places_map_from_cam: Array, map_from_cam: Array) -> NDArray[np.bool_]:
+    """Return (K,) which places (K, 4, 4) have mostly the same neighbourhood as a camera."""
+    return places_around(places_map_from_cam, map_from_cam, SAME_PLACE_M, _SAME_PLACE_COSINE)
 
 
 def _is_new(fix: Fix, others: Sequence[Fix]) -> bool:
