@@ -1,7 +1,6 @@
 """The library: maps built from recordings, and maps of a store as arrays. Paths are str or Path, errors FleetmapErrors."""
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -95,8 +94,7 @@ def build_map(
         raise UsageError("build_map: no recording is given; name one or more")
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
     _need_gtsam()
-    is_chosen = options.settings is not None or options.use is not None
-    with nullcontext() if is_chosen else open_recording(request.recordings[0], options.opening) as first:
+    with open_recording(request.recordings[0], options.opening) as first:
         request = replace(request, first=first)
         draft, built = build_draft(request, settings_for(request), recorded=True)
     return BuiltMap(draft.version, draft.sentence, draft.report, draft.left_out, request.store, site, built)
@@ -114,7 +112,7 @@ def settings_for(request: BuildRequest) -> SurveySettings:
     options, first = request.options, request.first
     if options.settings is not None:
         return options.settings
-    known = options.use if first is None else first.sensor_set
+    known = options.use or (None if first is None else first.sensor_set)
     return survey_settings(options.config, known or sensor_set_of(request.recordings[0], options.opening))
 
 

@@ -15,6 +15,7 @@ from fleetmap.bow.vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.free_memory import gc_frozen
 from fleetmap.hooks import plugins
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
@@ -162,7 +163,7 @@ def build_draft(
     console = plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
     reads = OpenRecordings(options, folder, request.first)
-    with single_threaded_libraries(), reads as reading, MappedImageStore(folder) as images:
+    with single_threaded_libraries(), gc_frozen(), reads as reading, MappedImageStore(folder) as images:
         run = _Run(request, reading, settings, zones, unusable, console, times, images)
         times.begin("examination")
         with run.tools() as tools:

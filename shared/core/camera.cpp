@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <vector>
 
 namespace fleetmap {
@@ -14,13 +13,11 @@ constexpr double kStep = 1e-6, kMissed = 1e-7;
 constexpr double kNearest = 1e-9;
 constexpr double kLargestAngle = 3.1;  // of equidistant lenses: straight back has no pixel
 
-// A lens without distortion.
-struct Straight {};
-
 // Radial-tangential distortion k1 k2 p1 p2 k3 k4 k5 k6. Sources: Brown 1966; OpenCV's order and its rational model.
 struct RadialTangential {
   double k1, k2, p1, p2, k3, k4, k5, k6;
   explicit RadialTangential(const double* k) : k1(k[0]), k2(k[1]), p1(k[2]), p2(k[3]), k3(k[4]), k4(k[5]), k5(k[6]), k6(k[7]) {}
+  bool is_none = k1 == 0 && k2 == 0 && p1 == 0 && p2 == 0 && k3 == 0 && k4 == 0 && k5 == 0 && k6 == 0;
 };
 
 // Equidistant fisheye k1 k2 k3 k4. Source: Kannala and Brandt 2006.
@@ -36,18 +33,14 @@ struct Sphere {
 };
 
 std::pair<double, double> distorted(const RadialTangential& lens, double x, double y) {
-  const auto& [k1, k2, p1, p2, k3, k4, k5, k6] = lens;
+  const auto& [k1, k2, p1, p2, k3, k4, k5, k6, is_none] = lens;
+  if (is_none) return {x, y};
   const double r2 = x * x + y * y;
   const double radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)));
   return {x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y};
 }
 
 // True if the lens sees a point in front of it; its distorted position in the plane z = 1.
-bool is_seen(const Straight&, double reach, Vec3 point, double* image) {
-  const double x = image[0] = point[0] / point[2], y = image[1] = point[1] / point[2];
-  return point[2] > kNearest && x * x + y * y < reach;
-}
-
 bool is_seen(const RadialTangential& lens, double reach, Vec3 point, double* image) {
   const double x = point[0] / point[2], y = point[1] / point[2];
   std::tie(image[0], image[1]) = distorted(lens, x, y);
@@ -104,9 +97,7 @@ auto undistort(const Array<double, 8>& coefficients, double reach, const Reals& 
 template <typename Use>
 void with_lens(const Reals& lens, const Use& use) {
   const size_t size = lens.shape(0);
-  if (size == 8 && std::all_of(lens.data(), lens.data() + 8, [](double k) { return k == 0.0; }))
-    use(Straight{});
-  else if (size == 8)
+  if (size == 8)
     use(RadialTangential(lens.data()));
   else if (size == 12)
     use(Sphere{RadialTangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
@@ -142,9 +133,9 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
   const size_t count = depth.size();
   check_rows(count, "rays: one for each pixel of depth", rays);
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
-  // Each point in the pixel at its upper left; a row and a column more are before the image.
+  // Each point in the pixel at its upper left; there are a row and a column before the image.
   const size_t columns = size_t(width) + 1;
-  std::vector<float> nearest(columns * (size_t(height) + 1), std::numeric_limits<float>::infinity());
+  std::vector<float> nearest(columns * (size_t(height) + 1), INFINITY);
   auto colour = zeros<float>(size_t(width) * size_t(height));
   with_lens(lens, [&](const auto& coefficients) {
     unlocked([&] {
@@ -156,16 +147,14 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
         if (!(point[2] > kNearest && is_seen(coefficients, reach, point, image))) continue;
         const double u = intrinsics(0) * image[0] + intrinsics(2), v = intrinsics(1) * image[1] + intrinsics(3);
         if (!(-1.0 <= u && u < double(width) && -1.0 <= v && v < double(height))) continue;
-        const int column = int(u) + int(u >= 0.0), row = int(v) + int(v >= 0.0);
-        float& held = nearest[size_t(row) * columns + size_t(column)];
+        float& held = nearest[size_t(std::floor(v) + 1.0) * columns + size_t(std::floor(u) + 1.0)];
         held = std::min(held, float(point[2]));
       }
       for (size_t row = 0; row < size_t(height); ++row)
         for (size_t column = 0; column < size_t(width); ++column) {
           const float* above = &nearest[row * columns + column];
-          const float* below = above + columns;
-          const float found = std::min(std::min(above[0], above[1]), std::min(below[0], below[1]));
-          colour[row * size_t(width) + column] = found < std::numeric_limits<float>::infinity() ? found : 0.0f;
+          const float found = std::min({above[0], above[1], above[columns], above[columns + 1]});
+          colour[row * size_t(width) + column] = std::isinf(found) ? 0.0f : found;
         }
     });
   });

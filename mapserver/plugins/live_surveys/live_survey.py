@@ -3,10 +3,9 @@
 Tracking is the survey's own odometry, frame by frame; its keyframes are the growing map's.
 """
 
-import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +15,7 @@ from rich.console import Console
 
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
+from fleetmap.free_memory import gc_frozen
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.recordings.images import jpeg_image
@@ -23,6 +23,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import Image, ImuSamples, WheelSample
 from mapserver.drafting.survey_recordings import read_zones
+from mapserver.drafting.worker import single_threaded_libraries
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys import message
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
@@ -184,7 +185,7 @@ class _Survey:
         """Track all frames, each when it is due; call `check` first."""
         drive, told_s = self._drive, 0.0
         # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
-        with _one_thread(), closing(self._mapping.start(self._config)):
+        with single_threaded_libraries(), gc_frozen(), closing(self._mapping.start(self._config)):
             tracking = LiveTracking(drive.calibration, drive.rectifier, drive.settings)
             with closing(drive.frames()) as frames:
                 for due in frames:
@@ -254,16 +255,3 @@ class _Survey:
         small = cv2.resize(self._seen, (width, height), interpolation=cv2.INTER_AREA)
         data = jpeg_image(np.asarray(small, np.uint8), _PICTURE_QUALITY).data
         return data if len(data) <= message.MAX_ARRAY_BYTES else b""
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        cv2.setNumThreads(before)

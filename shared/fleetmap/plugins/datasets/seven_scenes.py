@@ -58,9 +58,8 @@ class DepthRegistration:
     def __init__(self, colour: CameraCalibration, depth: CameraCalibration) -> None:
         self._colour = colour
         self._depth_size = (depth.height_px, depth.width_px)
-        colour_from_depth = se3_inverse(colour.body_from_cam) @ depth.body_from_cam
+        self._colour_from_depth = colour_from_depth = se3_inverse(colour.body_from_cam) @ depth.body_from_cam
         self._is_same_place = bool(np.linalg.norm(colour_from_depth[:3, 3]) < 1e-6)
-        self._colour_from_depth = colour_from_depth
         if self._is_same_place:
             # The depth pixel of every colour pixel, for any depth
             rays_colour = colour.ray_from_pixel(_pixels(colour))
