@@ -45,7 +45,7 @@ struct Surfaces {
   const double* bounds;
   size_t chunks;
 };
-constexpr int32_t kPlain = 0, kFloor = 1, kLamp = 2;  // materials
+constexpr int32_t kFloor = 1, kLamp = 2;  // materials; 0 is plain
 
 // Textures with all their coarser levels, one after the other. table (T, columns): logarithms of width and height, where each level
 // begins. decals: texture * 4 + quarter turns for each cell of the floor, -1 for none. The last two: the textures of concrete and dirt.

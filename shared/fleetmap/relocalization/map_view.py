@@ -223,9 +223,7 @@ class MapView:
     def neighbourhood(self, place: int) -> Rows:
         """Rows of all landmarks of places near one place with a similar viewing direction."""
         near = places_around(self.map_from_cam, self.map_from_cam[place], _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
-        is_near = np.zeros(len(self.landmark_ids), bool)  # numpy's `unique` hashes: ten times slower
-        is_near[self._shown[near[self._place_of_shown]]] = True
-        return np.flatnonzero(is_near)
+        return np.flatnonzero(np.bincount(self._shown[near[self._place_of_shown]]))  # `unique` hashes: ten times slower
 
 
 def most_similar(similarities: Array, allowed: NDArray[np.bool_] | None, top: int) -> Rows:
