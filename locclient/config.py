@@ -25,7 +25,7 @@ TIERS = {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays surveys",
         "source": "kind sensors calibration recording device",
-        "output": "format endpoint robot_height_m autostart",
+        "output": "format endpoint robot_height_m stop_above_m autostart",
         "topics": "*",
     },
     "tuning": {
@@ -41,7 +41,7 @@ TIERS = {
         "localizer.odometry.filter": "use_wheels",
         "localizer.fix": "min_recall",
         "localizer.track": "fix_interval_s settled_interval_s strong_inliers is_whole_site_mapped telling_evidence "
-        "degraded_after_s degraded_radius_m lost_radius_m kidnap_fixes",
+        "degraded_after_s degraded_radius_m lost_radius_m kidnap_fixes protection_risk",
         "localizer.image_quality": "dark_contrast glare_share blurred_share occluded_depth_share",
     },
 }

@@ -11,6 +11,7 @@
 """
 
 from collections.abc import Callable, Mapping
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fleetmap.config import Section
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 
 class LinkedRobot(NamedTuple):
-    """What a link may use of its robot. lost_radius_m: 95 % radius beyond which a pose is LOST.
+    """What a link may use of its robot. lost_radius_m: 95 % radius beyond which a pose is LOST. stop_above_m: protection
+    level beyond which the robot must not drive by it.
 
     client: with the cache, on the thread of `RobotLink.work`; its `trust` is None without a map server. offer: passes a version to the
     localizer.
@@ -44,6 +46,7 @@ class LinkedRobot(NamedTuple):
     lost_radius_m: float
     offer: Callable[[WantedVersion], None]
     put_prior: Callable[[PositionPrior], None]
+    stop_above_m: float = inf
 
 
 class RobotLink(NamedTuple):

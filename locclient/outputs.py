@@ -1,6 +1,7 @@
 """Settings of the estimates that a robot publishes to its own programs, and the interface through which they reach them."""
 
 from abc import ABC, abstractmethod
+from math import inf
 from typing import Annotated
 
 import msgspec
@@ -17,6 +18,7 @@ class OutputSection(Section, frozen=True):
 
     format: str = "messagepack"
     endpoint: str | None = None
+    stop_above_m: Annotated[float, msgspec.Meta(gt=0)] = inf
     robot_height_m: Annotated[float, msgspec.Meta(gt=FLOOR_M, le=TOP_M)] = 1.1
     autostart: bool = True
     namespace: str = ""

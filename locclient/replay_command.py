@@ -83,6 +83,9 @@ class ResultFiles:
     report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
     trajectory: Annotated[Path | None, typer.Option(help="Write the localized frames to this TUM file.")] = None
     picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
+    protection_picture: Annotated[
+        Path | None, typer.Option(help="Draw errors and protection levels (Stanford diagram) into this PNG file.")
+    ] = None
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
 
     def write(self, result: "ReplayResult", report: dict[str, object]) -> None:
@@ -96,13 +99,17 @@ class ResultFiles:
             write_tum(self.trajectory, result.trajectory)
         if self.picture is not None:
             result.save_picture(self.picture)
+        if self.protection_picture is not None:
+            from locclient.replay.plots import draw_protection, save_picture
+
+            save_picture(draw_protection(result.frames), self.protection_picture)
 
     def check(self) -> None:
         """Raise UsageError for files that cannot be written."""
         for name, path in vars(self).items():
             if path is not None and not path.parent.is_dir():
                 raise UsageError(f"--{name} {path}: the folder {path.parent} does not exist; make it first")
-        for name, suffix in (("picture", ".png"), ("mcap", ".mcap")):
+        for name, suffix in (("picture", ".png"), ("protection_picture", ".png"), ("mcap", ".mcap")):
             path = getattr(self, name)
             if path is not None and path.suffix.lower() != suffix:
                 raise UsageError(f"--{name} {path} must end in {suffix}")

@@ -90,10 +90,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             maps = LocalMapSource(Path(run.store or ""), address.site)
             first = maps.wanted()
             address_of(first)  # LinkError without one
-        keeps_replay = address.server is not None and run.replays != "off"
+        keeps = address.server is not None and run.replays != "off"
         priors = image_priors_of(config, rectifier.mounted[0], calibration.base_from_body)
-        settings = config.localizer, run.trial
-        robot = Robot(rectifier, *settings, time.thread_time, keeps_replay=keeps_replay, image_priors=priors)
+        robot = Robot(rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps, image_priors=priors)
         if prior is not None:
             robot.localizer.handle_prior(prior)
         publisher = _opened_publisher(stack, config, address, bus, calibration, intake)
@@ -114,6 +113,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             caches=caches,
             building=_building_maps(address, caches, server, maps),
             drives=None if server is None else server.drives,
+            stop_above_m=config.output.stop_above_m,
         )
 
 
@@ -188,7 +188,8 @@ def _server(
     server = ServerSync(client, outbox, retry_s=retry_s, identity=address.identity, put_prior=intake.put_prior)
     server.is_alone = address.server is None
     lost_radius_m = config.localizer.track.lost_radius_m
-    robot = LinkedRobot(client, config.run.insecure, lost_radius_m, server.fetched.append, intake.put_prior)
+    hands = server.fetched.append, intake.put_prior
+    robot = LinkedRobot(client, config.run.insecure, lost_radius_m, *hands, config.output.stop_above_m)
     server.links = [hook.open(section, robot) for hook, section in links_of(config)]
     return server
 

@@ -35,6 +35,7 @@ class MessagePackPublisher(Publisher):
             cov_rot_trans=None if published.cov_rot_trans is None else covariance_entries(published.cov_rot_trans),
             hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in hypotheses),
             floor=estimate.floor,
+            **estimate.protection,
             hypothesis_floors=tuple(h.floor for h in hypotheses) if published.level else (),
         )
         self._bus.publish(self._key, encode_message(message), may_drop=True)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.log_lines import LogLimit
-from fleetmap.messages import RobotHealth, WantedVersion, encode_message
+from fleetmap.messages import RobotHealth, Status, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from fleetmap.threads import Jobs, ended_by_threads
@@ -51,7 +52,8 @@ _log = logging.getLogger(__name__)
 
 
 class RuntimeParts(NamedTuple):
-    """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with."""
+    """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with. stop_above_m: protection
+    level above which nobody but the map server is told that the robot is TRACKING."""
 
     profile: RobotProfile
     source: Source
@@ -67,6 +69,7 @@ class RuntimeParts(NamedTuple):
     drives: SurveyDrives | None = None
     caches: tuple[TileCache, ...] = ()
     building: BuildingMaps | None = None
+    stop_above_m: float = inf
 
 
 class Runtime:
@@ -191,11 +194,14 @@ class Runtime:
     def _after_frame(self, outcome: Outcome) -> None:
         estimate = outcome.estimate
         self._site = estimate.floor
-        _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
+        said = outcome
+        if estimate.status is Status.TRACKING and estimate.protection_m > self._parts.stop_above_m:
+            said = replace(outcome, estimate=replace(estimate, status=Status.DEGRADED))
+        _send(partial(self._publisher.publish, said.estimate, said.published, self._robot.base_from_body))
         for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.versions.held)
             visited = {site: loaded.version for site, loaded in self._robot.visited.items()}
-            link.after_frame(outcome, held, self._robot.building, visited)
+            link.after_frame(said, held, self._robot.building, visited)
         was_lost, last = self._figures.search.is_long, self._figures.last
         if last is None or (estimate.status, estimate.floor) != (last.estimate.status, last.estimate.floor):
             _log.info("status %s", estimate.in_words)

@@ -73,6 +73,12 @@ class Estimate:
         return not self.floor
 
     @property
+    def protection(self) -> dict[str, float | None]:
+        """Return the levels by name, for messages: None where nothing is promised."""
+        named = {"protection_m": self.protection_m, "protection_deg": self.protection_deg}
+        return {name: level if level < inf else None for name, level in named.items()}
+
+    @property
     def in_words(self) -> str:
         """Return status, cause, version and uncertainty of the position."""
         cause = f" ({self.cause.value})" if self.cause.value else ""

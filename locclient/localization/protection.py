@@ -13,15 +13,18 @@ from fleetmap.geometry import length, se3_inverse
 from fleetmap.messages import Status
 from fleetmap.pnp.pnp import REFINEMENT
 from locclient.localization.alias_disambiguation import is_other_viewpoint
-from locclient.localization.calibration.parameters import HEIGHT, PARAMETERS, TILT, TIME_OFFSET
+from locclient.localization.calibration.parameters import DRIFT_SIGMAS, HEIGHT, PARAMETERS, TILT, TIME_OFFSET
 from locclient.localization.estimate import Estimate
 from locclient.localization.place import ORIGIN
 from locclient.localization.pose_tracker import PoseTracker, QueryResult
 from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import TrackSettings
 
-_WRONG_SHARE = 0.05  # of other places that match as one look does, at least: views of one rack are not independent
-_LOOK_M = 0.5  # between such looks
+# Share of other places that match as one look does: of a map whose build did not measure it, and the least, since views of one rack are
+# not independent. One that matches twice as well counts as two looks at most, by an exponential tail.
+_WRONG_SHARE, _LEAST_SHARE, _MOST_LOOKS = 0.05, 0.02, 2.0
+_LOOK_M = 0.5  # between looks
+_MOVED_SIGMAS = 3.0  # of a parameter of the mounting, from which on it counts
 _MOUNTING = PARAMETERS[TILT.start : HEIGHT]
 
 
@@ -55,8 +58,8 @@ class ProtectionMonitor:
         if stamp_ns is None or asked is None:
             return
         lookalikes = tracker.maps.lookalikes
-        share = 0.0 if lookalikes is None else min(lookalikes.max_wrong_share, 1.0)
-        evidence = -log(max(share, _WRONG_SHARE))  # of a look: how rarely another place shows as much
+        share = _WRONG_SHARE if lookalikes is None else min(max(lookalikes.max_wrong_share, _LEAST_SHARE), 1.0)
+        evidence = -log(share)  # of a look
         if way is not None:
             evidence *= min(1.0, length(way.then.position_m) / _LOOK_M)
         if fix is None or fix.matched is None:
@@ -85,8 +88,11 @@ class ProtectionMonitor:
             cov_moved,
         )
         tracker.followed = asked
-        looks = 1 if way is not None else min(confirmed.support, 1 + int(confirmed.travelled_m / _LOOK_M))
-        self._log_odds += looks * evidence if lookalikes is None or fix.landmark_recall > lookalikes.recall else 0.0
+        looks = 1.0 if way is not None else min(confirmed.support, 1.0 + confirmed.travelled_m // _LOOK_M)
+        if lookalikes is not None:
+            is_telling = fix.landmark_recall > lookalikes.recall
+            looks *= min(max(fix.inliers / lookalikes.inliers, 1.0), _MOST_LOOKS) if is_telling else 0.0
+        self._log_odds += looks * evidence
         if way is None and self._prior is not None and self._prior.confirms(confirmed):
             wrong = self._settings.wrong_prior_share if self._prior.is_revisable else self._settings.protection_risk
             self._log_odds -= log(wrong)
@@ -103,13 +109,18 @@ class ProtectionMonitor:
         is_doubted = self._is_refused or any(h.speaks_against_others(settings) for h in tracker.candidates.hypotheses)
         if is_late or is_doubted or self._log_odds < -log(risk):
             return estimate
-        here, moved, cov_moved = map(np.ascontiguousarray, (map_from_body, *way.now[:2]))
+        here, since, cov_since = map(np.ascontiguousarray, (map_from_body, *way.now[:2]))
         cov_map = tracker.maps.map_cov(confirmed.now)
-        level_m, level_rad = self._bank.level(here, moved, cov_moved, cov_map, self._base_point, risk)
-        drifts = {drift.parameter: abs(drift.value) + drift.sigma for drift in estimate.calibration.drifts}
-        turned_rad = length(np.array([drifts.get(parameter, 0.0) for parameter in _MOUNTING]))
-        level_m += turned_rad * length(self._base_point) + drifts.get(PARAMETERS[HEIGHT], 0.0)
-        level_m += TIME_OFFSET.limit * length(estimate.odometry.velocity_odom_mps) if self.has_wheels else 0.0
+        level_m, level_rad = self._bank.level(here, since, cov_since, cov_map, self._base_point, risk)
+        moved = {
+            d.parameter: abs(d.value) for d in estimate.calibration.drifts if abs(d.value) > _MOVED_SIGMAS * d.sigma
+        }
+        turned_rad = length(np.array([moved.get(parameter, 0.0) for parameter in _MOUNTING]))
+        level_m += turned_rad * length(self._base_point) + moved.get(PARAMETERS[HEIGHT], 0.0)
+        off_s = (
+            DRIFT_SIGMAS * TIME_OFFSET.least_sigma if self.has_wheels else 0.0
+        )  # that the odometry may not have found
+        level_m += off_s * length(estimate.odometry.velocity_odom_mps)
         if level_m > 0.5 * tracker.maps.alias_step_m:  # the next place that looks alike would be within
             return estimate
         return replace(estimate, protection_m=level_m, protection_deg=float(np.degrees(level_rad + turned_rad)))

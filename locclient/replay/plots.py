@@ -31,6 +31,7 @@ _WIDTH, _PLAN_WIDTH, _TOP, _LEFT, _BELOW = 2040, 1220, 140, 100, 140
 _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 520.0, 1100.0
 _LIMIT_MM = 1e3 * ERROR_LIMIT_M
 _MAX_LANDMARKS = 40_000
+_STANFORD, _LEVEL_LIMIT_MM = 900, 500.0
 _SHIFT = 4  # fractional bits of a coordinate
 
 
@@ -44,11 +45,30 @@ class RunPlot(NamedTuple):
     landmarks_map_m: Array
 
 
-def save_picture(plot: RunPlot, path: Path) -> None:
-    """Write the picture as PNG; UsageError if it cannot be written."""
-    _, data = cv2.imencode(".png", draw_run(plot))
+def save_picture(picture: Picture, path: Path) -> None:
+    """Write a picture as PNG; UsageError if it cannot be written."""
+    _, data = cv2.imencode(".png", picture)
     with disk_errors(f"the picture cannot be written to {path}", "check the path", UsageError):
         path.write_bytes(data.tobytes())
+
+
+def draw_protection(frames: Sequence[FrameRecord]) -> Picture:
+    """Return the Stanford diagram (900, 900, 3) BGR of the frames while TRACKING: each one's error and its protection level, which must be
+    above it. Levels beyond the axis, and those of frames without a promise, are at its end. Source: Tossaint et al. 2007."""
+    picture = np.full((_STANFORD, _STANFORD, 3), 255, np.uint8)
+    low, high = (_LEFT, _LEFT), (_STANFORD - 60, _STANFORD - _LEFT)
+    axes = _Axes(picture, low, high, np.zeros(2), np.full(2, _LEVEL_LIMIT_MM))
+    axes.draw_frame("position error, mm; upwards the protection level, mm")
+    axes.line(np.array([[0.0, 0.0], [_LEVEL_LIMIT_MM] * 2]), _BAD, 2)
+    known = [f for f in frames if f.error_m is not None and f.status is Status.TRACKING]
+    values_mm = 1e3 * np.array([(f.error_m, f.protection_m) for f in known]).reshape(-1, 2)
+    bad, none = values_mm[:, 0] > values_mm[:, 1], values_mm[:, 1] >= _LEVEL_LIMIT_MM
+    for place, is_bad, is_none in zip(axes.pixels(np.minimum(values_mm, _LEVEL_LIMIT_MM)), bad, none, strict=True):
+        axes.dot(place, 2.5, _BAD if is_bad else _NOT_LOCALISED if is_none else _ERROR)
+    counts = int((~bad & ~none).sum()), int(none.sum()), int(bad.sum())
+    named = zip(("within: {}", "no level: {}", "beyond: {}"), (_ERROR, _NOT_LOCALISED, _BAD), counts, strict=True)
+    _legend(picture, (_LEFT, _LEFT - 18), [(words.format(count), colour) for words, colour, count in named])
+    return picture
 
 
 def draw_run(plot: RunPlot) -> Picture:

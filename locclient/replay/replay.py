@@ -147,6 +147,7 @@ def _add(result: ReplayResult, outcome: Outcome, truth: Array | None, wall_s: fl
         stage_s={**outcome.stage_s, "decode": decode_s},
         speed_mps=outcome.speed_mps,
         may_be_mapped=outcome.may_be_mapped,
+        protection_m=estimate.protection_m,
     )
     result.frames.append(record)
     result.estimates.append(estimate)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Status
 
 WARM_UP_FRAMES = 20
+_USABLE_M = 0.5
 
 
 class FrameRecord(NamedTuple):
@@ -20,6 +22,7 @@ class FrameRecord(NamedTuple):
     Errors are unaligned against the truth in the map's frame, None if either is unknown; error_map_m (3,) is estimate minus
     truth. cpu_s and wall_s: from decoded images to estimate. stage_s: seconds by stage, decoding included. speed_mps: by wheels or
     odometry, None if unknown. may_be_mapped: False if the robot knows that the map does not cover its place.
+    protection_m: as of `Estimate`.
     """
 
     stamp_ns: int
@@ -33,6 +36,7 @@ class FrameRecord(NamedTuple):
     stage_s: dict[str, float]
     speed_mps: float | None = None
     may_be_mapped: bool = True
+    protection_m: float = inf
 
     @property
     def radius_95_m(self) -> float:
@@ -116,6 +120,24 @@ def error_deg(frames: Frames) -> dict[str, float] | None:
 
 def _good(frames: Frames) -> list[FrameRecord]:
     return [frame for frame, is_localised in zip(frames, localised(frames), strict=True) if is_localised]
+
+
+def protection(frames: Frames) -> dict[str, object] | None:
+    """Return how errors and protection levels compare while TRACKING: the share with a level below 0.5 m, levels, and with ground truth the
+    share of errors beyond their level, and the median of errors over levels. None if it was never TRACKING."""
+    tracked = [frame for frame in frames if frame.status is Status.TRACKING]
+    levels_m = [frame.protection_m for frame in tracked if frame.protection_m < inf]
+    shares = [f.error_m / f.protection_m for f in tracked if f.error_m is not None and f.protection_m < inf]
+    return (
+        {
+            "available_share": float(np.mean([frame.protection_m < _USABLE_M for frame in tracked])),
+            "level_m": spread(levels_m, ("median", "p90", "p99", "max")),
+            "beyond_share": float(np.mean([share > 1.0 for share in shares])) if shares else None,
+            "error_of_level": spread(shares, ("median", "max")),
+        }
+        if tracked
+        else None
+    )
 
 
 def status_share(frames: Frames) -> dict[str, float]:
@@ -209,7 +231,7 @@ def spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | No
     """Return mean, median or percentiles of the values by name; None without values."""
     if not values:
         return None
-    shares = {"p50": 50, "median": 50, "p95": 95, "p99": 99, "max": 100}
+    shares = {"p50": 50, "median": 50, "p90": 90, "p95": 95, "p99": 99, "max": 100}
     return {name: float(np.mean(values) if name == "mean" else np.percentile(values, shares[name])) for name in names}
 
 
@@ -224,6 +246,7 @@ METRICS: dict[str, Callable[[Frames], object]] = {
     "stage_ms": stage_ms,
     "error_m": error_m,
     "error_deg": error_deg,
+    "protection": protection,
     "position_failures": position_failures,
     "silent_failures": silent_failures,
     "status_share": status_share,

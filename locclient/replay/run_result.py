@@ -11,7 +11,7 @@ from fleetmap.messages import Status
 from fleetmap.sensors.samples import Stamps, Trajectory
 from locclient.localization.estimate import Estimate
 from locclient.maps.loaded_map import LoadedMap
-from locclient.replay.plots import RunPlot, save_picture
+from locclient.replay.plots import RunPlot, draw_run, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
 from locclient.robot.health_report import SearchWay
 
@@ -114,7 +114,7 @@ class ReplayResult:
             truths_map_m=_stacked([truth if self.truth_in_map else None for truth in self.truths], 4)[:, :3, 3],
             landmarks_map_m=np.concatenate([tile.points_map for tile in self.loaded.tiles.values()]),
         )
-        save_picture(plot, Path(path))
+        save_picture(draw_run(plot), Path(path))
 
 
 def _stacked(matrices: list[Array | None], size: int) -> Array:

@@ -181,6 +181,7 @@ class HealthFigures:
         return {
             "speed_mps": outcome.speed_mps,
             "radius_95_m": known_radius_m(last.cov_rot_trans),
+            **last.protection,
             "exposure": last.image.exposure,
             "sharpness": last.image.sharpness,
             **last.calibration.figures,

@@ -30,6 +30,8 @@ _FIGURES = (
     ("Brightness of the image (0 to 1)", "exposure", "{:.2f}"),
     ("Sharpness (1 is usual)", "sharpness", "{:.2f}"),
     ("Believed uncertainty (95 % radius)", "radius_95_m", "{:.2f} m"),
+    ("Protection level of the position", "protection_m", "{:.2f} m"),
+    ("Protection level of the heading", "protection_deg", "{:.1f}°"),
     ("Speed", "speed_mps", "{:.2f} m/s"),
     ("Failure reports that wait", "spool_waiting", "{:.0f}"),
 )

@@ -243,6 +243,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     while there is no single pose. cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it.
     hypotheses: competing poses while AMBIGUOUS. calibration: the wrong parameter and its error, if that is the cause. floor: site whose map
     the pose is of, in a building, empty for the robot's own; hypothesis_floors: of each hypothesis, empty for a site without floors.
+    protection_m, protection_deg: what the errors of position and rotation exceed once in 100,000 fixes, None where nothing is promised.
     """
 
     stamp_ns: int
@@ -255,6 +256,8 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     cov_rot_trans: Annotated[tuple[float, ...], msgspec.Meta(min_length=36, max_length=36)] | None
     hypotheses: Annotated[tuple[Placement, ...], msgspec.Meta(max_length=16)] = ()
     floor: Name = ""
+    protection_m: float | None = None
+    protection_deg: float | None = None
     hypothesis_floors: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
 
 

@@ -305,6 +305,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
             estimate, published = self._last
             status, cause, cov = estimate.status.value, estimate.cause.value, estimate.cov_rot_trans
             state = _LEVELS.get(estimate.status, _WARN), f"{status}: {cause}" if cause else status
+            if estimate.protection_m > self._section.stop_above_m:
+                state = _ERROR, f"stop: the protection level is above {self._section.stop_above_m:g} m ({state[1]})"
             values |= {
                 "status": status,
                 "cause": cause,
@@ -313,6 +315,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
                 "calibration": estimate.calibration.text,
                 "views": estimate.views_in_words or None,
                 "radius_95_m": None if cov is None else f"{radius_95_m(cov):.3f}",
+                **{name: "none" if level is None else f"{level:.3f}" for name, level in estimate.protection.items()},
             }
             if published.level:
                 floors = sorted({hypothesis.floor or "own" for hypothesis in estimate.hypotheses})

@@ -264,7 +264,8 @@ class FleetAdapter:
             self._in_use, self._building, self._visited_versions = in_use, building, visited
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
-            self._see(self._localization.after(outcome, self._robot.lost_radius_m, self._fleet_from_map))
+            robot = self._robot
+            self._see(self._localization.after(outcome, robot.lost_radius_m, self._fleet_from_map, robot.stop_above_m))
             self._judge_position()
 
     def silence(self) -> None:

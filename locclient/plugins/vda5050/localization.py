@@ -1,6 +1,6 @@
 """Localization in VDA 5050 terms, from a robot's estimates: position and LOCALIZATION_ERROR. Pure."""
 
-from math import atan2, hypot, pi
+from math import atan2, hypot, inf, pi
 from typing import NamedTuple
 
 from fleetmap.failure_definition import is_driving, radius_95_m
@@ -27,12 +27,13 @@ _WORDS = {
 _STATUS_WORDS = {
     Status.AMBIGUOUS: "several places match the images; drive on, or send initializePosition",
     Status.INITIALISING: "the robot is not localized yet; drive on, or send initializePosition",
+    Status.DEGRADED: "the pose is less sure than lost_radius_m or [output] stop_above_m allow; more of the map in view helps",
     Status.LOST: "the robot has lost its pose; drive on, or send initializePosition",
 }
 
 
 class Position(NamedTuple):
-    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized. site: another one
+    """A pose of the base in the fleet manager's frame. radius_m: its protection level, infinite if none is promised. site: another one
     of the robot's building, whose map it is in; empty for its own.
     """
 
@@ -60,8 +61,11 @@ class Localization(NamedTuple):
     is_silent: bool = True
     is_aligned: bool = True
 
-    def after(self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None) -> "Localization":
-        """Update by the results of one frame. Beyond lost_radius_m (95 %) a position is unusable for driving at any status.
+    def after(
+        self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None, stop_above_m: float = inf
+    ) -> "Localization":
+        """Update by the results of one frame. Beyond lost_radius_m (95 %) a position is unusable for driving at any status, and so is one
+        whose protection level is above stop_above_m.
 
         fleet_from_map: None if the map does not define the fleet manager's frame; there is then no position.
         """
@@ -73,14 +77,16 @@ class Localization(NamedTuple):
             fleet_from_base = fleet_from_map @ published.map_from_odom @ published.odom_from_base
             x_m, y_m = (float(value) for value in fleet_from_base[:2, 3])
             heading_rad = float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0]))
-            position = Position(x_m, y_m, heading_rad, radius_95_m(estimate.cov_rot_trans), estimate.floor)
-            is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
+            position = Position(x_m, y_m, heading_rad, estimate.protection_m, estimate.floor)
+            is_near = radius_95_m(estimate.cov_rot_trans) <= lost_radius_m and estimate.protection_m <= stop_above_m
+            is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and is_near
         drives = speed_mps is not None and is_driving(speed_mps)  # an unknown one is none: nobody may rely on it
         is_aligned = fleet_from_map is not None
         return Localization(estimate, position, is_localized, drives, is_silent=False, is_aligned=is_aligned)
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
-        """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m.
+        """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 where its
+        protection level reaches lost_radius_m or none is promised; deviationRange is that level.
 
         map_id: of the robot's own site; other maps are called by their sites.
         """
@@ -92,7 +98,7 @@ class Localization(NamedTuple):
         found |= {"mapId": place.site or map_id, "localized": is_localized, "localizationScore": 0.0}
         if is_localized:
             found["localizationScore"] = max(0.0, 1.0 - place.radius_m / lost_radius_m)
-            found["deviationRange"] = place.radius_m
+            found |= {"deviationRange": place.radius_m} if place.radius_m < inf else {}
         return found
 
     def error(self) -> Error | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_exp
 from fleetmap.messages import Status
 from locclient.replay import run_metrics
-from locclient.replay.plots import RunPlot, draw_run, ticks
+from locclient.replay.plots import RunPlot, draw_protection, draw_run, ticks
 from locclient.replay.run_metrics import METRICS, FrameRecord
 from locclient.replay.run_result import ReplayResult
 
@@ -48,6 +48,18 @@ def counts(frames: Iterable[FrameRecord]) -> tuple[object, object]:
     """(silent, position) failures."""
     listed = list(frames)
     return METRICS["silent_failures"](listed), METRICS["position_failures"](listed)
+
+
+def test_errors_are_compared_with_their_levels() -> None:
+    levels = [(0.01, 0.1), (0.02, 0.1), (0.3, 0.2), (0.0, 0.6), (0.0, np.inf)]
+    frames = [frame(0.1 * k, error_m=e)._replace(protection_m=level) for k, (e, level) in enumerate(levels)]
+    found = run_metrics.protection(frames)
+    assert found is not None and found["available_share"] == 0.6 and found["beyond_share"] == 0.25
+    assert found["error_of_level"] == {"median": pytest.approx(0.15), "max": pytest.approx(1.5)}
+    drawn, without = (draw_protection(shown) for shown in (frames, frames[:2]))
+    assert (drawn[510:530, 534:554] == (47, 52, 209)).all(axis=2).any()  # of the error beyond its level, red
+    assert not (without[510:530, 534:554] == (47, 52, 209)).all(axis=2).any()
+    assert run_metrics.protection([frame(0.0, L)]) is None
 
 
 def test_dense_frames_are_localised_by_status() -> None:

@@ -56,12 +56,13 @@ def seen(
 
 def frame(
     placed: PublishedPose, status: Status = Status.TRACKING, cause: Cause = Cause.NONE, *, sigma_m: float = 0.01,
-    version: int = 1, floor: str = "",
+    version: int = 1, floor: str = "", protection_m: float = 0.1,
 ) -> Any:  # fmt: skip
     """What the robot makes of a frame."""
     estimate = SimpleNamespace(
-        status=status, cause=cause, stamp_ns=7, cov_rot_trans=np.eye(6) * sigma_m**2, map_version=version, floor=floor
-    )
+        status=status, cause=cause, stamp_ns=7, cov_rot_trans=np.eye(6) * sigma_m**2, map_version=version, floor=floor,
+        protection_m=protection_m,
+    )  # fmt: skip
     return SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
 
 
@@ -124,6 +125,16 @@ def test_a_position_is_said_as_sure_as_it_is() -> None:
     assert place["localizationScore"] == pytest.approx(0.96)
     assert adapter.error_types() == []
     assert adapter.said()["powerSupply"] == PART["powerSupply"]
+
+
+@pytest.mark.parametrize(("level_m", "is_localized"), [(0.2, True), (0.31, False), (np.inf, False)])
+def test_a_robot_stops_above_its_alert_limit(level_m: float, is_localized: bool) -> None:
+    placed = PublishedPose(np.eye(4), np.eye(4))
+    localization = Localization().after(frame(placed, protection_m=level_m), 3.0, np.eye(4), stop_above_m=0.3)
+    position = localization.mobile_robot_position("hall", 3.0)
+    assert position is not None and position["localized"] is is_localized
+    assert (localization.error() is None) is is_localized
+    assert position["localizationScore"] == pytest.approx(1 - level_m / 3 if is_localized else 0.0)
 
 
 @pytest.mark.parametrize("status", [Status.LOST, Status.AMBIGUOUS, Status.INITIALISING])
