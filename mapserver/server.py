@@ -113,10 +113,10 @@ class Server:
         webhook = None
         if settings.alerts.webhook is not None:
             webhook = plugin("mapserver.alerts", "webhook", "[alerts] webhook")(settings.alerts)
-        drives = None if nights is None else RobotDrives(maps, nights)
+        drives = None if nights is None else RobotDrives(maps, nights, waits=settings.canary.builds)
         take = None if drives is None else drives.take
         bus_service = BusService(maps, fleet, self.bus, metrics.count_bus, self.robots, take)
-        usual = tasks.server_tasks(maps, fleet, bus_service, settings.canary)
+        usual = tasks.server_tasks(maps, fleet, bus_service, settings.canary, settings.resurvey)
         if drives is not None:
             usual.append(BackgroundTask("building robots' drives", 60.0, drives.build))
         api = ApiSettings(self.guard, settings, self.certificate, webhook, nights)

@@ -13,9 +13,9 @@ from mapserver.dashboard.map_layers import Layer, Outline, Picture, square
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.fleet.alerts import with_acts
+from mapserver.fleet.resurvey_list import courses_of
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Area, Areas, due_corrections
-from mapserver.floor_plan.survey_requests import courses
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
 from mapserver.quality.gate import CHECKS
@@ -23,7 +23,6 @@ from mapserver.releases.version_diff import Difference
 from mapserver.store import Event, SiteReleases, VerdictRow, VersionInfo
 
 _EVENTS_SHOWN = 50
-_COURSES_NS = 14 * 86_400_000_000_000
 _STATES = {
     "current": ("good", "current"),
     "draft": ("warn", "draft"),
@@ -83,7 +82,6 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
     forgets, now_ns = _waiting(maps, site), time.time_ns()
-    lately = maps.store.events(site, (now_ns - _COURSES_NS, now_ns))
     # Areas that wait are requests of their own, which hide nothing.
     drawn = [ring.round(2).tolist() for area in forgets for ring in area.outlines]
     others = [one for one in requests if one.corners_map_m not in drawn]
@@ -116,7 +114,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "waiting": [area.name for area in forgets],
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
-        "courses": courses((e.stamp_ns, e.kind, e.detail) for e in lately),
+        "courses": courses_of(maps.store, site, services.settings.config.resurvey, now_ns),
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }

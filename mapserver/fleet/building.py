@@ -24,7 +24,7 @@ from mapserver.floor_plan.masks import check_masks_on_map
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile
 from mapserver.floor_plan.rmf import RmfLevel
-from mapserver.floor_plan.survey_requests import ASKED, KIND, SurveyRequest
+from mapserver.floor_plan.survey_requests import ASKED, KIND, TILES, SurveyRequest
 from mapserver.store import Actor, MapStore
 from mapserver.store.map_store import AREAS_BEFORE
 
@@ -179,7 +179,8 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
 
     UsageError for an unknown site or an invalid polygon (simple, at most MOST_SIDE_M each way), StateError without a map and for too many.
     """
-    if store.current(site) is None:
+    current = store.current(site)
+    if current is None:
         raise StateError(f"site {site} has no published map to resurvey; publish one first")
     if len(store.survey_requests(site)) >= MOST_REQUESTS:
         raise StateError(f"site {site} has {MOST_REQUESTS} open requests; close some first")
@@ -200,7 +201,9 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
     made = SurveyRequest(hashlib.sha256(data).hexdigest()[:8], asked_ns, actor.name, actor.reason, ring)
     middle = np.array(ring).mean(axis=0)
     named = store.areas(site).at(*middle.tolist())
-    words = f"{ASKED}{f'{named}, ' if named else ''}{area.size_m2:.0f} m2 around {middle[0]:.1f}, {middle[1]:.1f} m"
+    tiles = " ".join(f"{x},{y}" for x, y in made.tiles(store.manifest(site, current.version).tile_size_m))
+    place = f"{area.size_m2:.0f} m2 around {middle[0]:.1f}, {middle[1]:.1f} m"
+    words = f"{ASKED}{f'{named}, ' if named else ''}{place}{TILES}{tiles}"
     store.keep_site_files(site, {KIND + made.id: data}, words, actor=actor)
     return made
 

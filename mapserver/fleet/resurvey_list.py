@@ -9,16 +9,18 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.manifest import TileEntry
 from fleetmap.mapformat.tile import decode_tile
 from mapserver.fleet_statistics import resurvey_decision as decision
-from mapserver.fleet_statistics.kpis import Counters, hour_of
-from mapserver.floor_plan.survey_requests import SurveyRequest
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, driven_words, hour_of, kpis
+from mapserver.floor_plan.survey_requests import SurveyCourse, SurveyRequest, courses
 from mapserver.store import MapStore
+
+_COURSES_NS = 14 * 24 * HOUR_NS
 
 
 @dataclass(frozen=True, slots=True)
 class ResurveyList:
     """Tiles to resurvey, the most urgent first, and a route through them; version: the current one, None if absent.
 
-    requests: of operators; the tiles of requests come first.
+    requests: open ones; their tiles come first. courses: of the requests of the last 14 days, the latest first.
     """
 
     site: str
@@ -26,6 +28,7 @@ class ResurveyList:
     tiles: list[decision.TileConcern]
     route: list[decision.Waypoint]
     requests: list[SurveyRequest]
+    courses: list[SurveyCourse]
 
 
 def resurvey_list(store: MapStore, site: str, settings: decision.ResurveySettings, now_ns: int) -> ResurveyList:
@@ -36,9 +39,9 @@ def resurvey_list(store: MapStore, site: str, settings: decision.ResurveySetting
     recent = store.fleet.counters_of(site, "tile", recent_hour)
     before = store.fleet.counters_of(site, "tile", before_hour, recent_hour)
     found = decision.concerns(recent, before, settings)
-    requests = store.survey_requests(site)
+    requests, became = store.survey_requests(site), courses_of(store, site, settings, now_ns)
     if current is None:
-        return ResurveyList(site, None, found, [], requests)
+        return ResurveyList(site, None, found, [], requests, became)
     manifest = store.manifest(site, current.version)
     # Requested tiles come first; a request is a reason beside the statistical ones.
     asked, known = _asked(requests, manifest.tile_size_m), {concern.tile: concern for concern in found}
@@ -54,7 +57,26 @@ def resurvey_list(store: MapStore, site: str, settings: decision.ResurveySetting
     found = [replace(concern, name=areas.name_tiles(concern.name, manifest.tile_size_m)) for concern in found]
     tiles = [concern.tile for concern in found if concern.tile in entries]
     places = {tile: _place(store, entries[tile], manifest.tile_size_m) for tile in tiles}
-    return ResurveyList(site, current.version, found, decision.route(found, places), requests)
+    return ResurveyList(site, current.version, found, decision.route(found, places), requests, became)
+
+
+def courses_of(store: MapStore, site: str, settings: decision.ResurveySettings, now_ns: int) -> list[SurveyCourse]:
+    """Return what became of the requests of the last 14 days, the latest first, with the effect of those in use.
+
+    Before: from `recent_days` ahead of the request to its use. The hour in which the version was published counts for neither side.
+    """
+    found = courses((e.stamp_ns, e.kind, e.detail) for e in store.events(site, (now_ns - _COURSES_NS, None)))
+    for course in (course for course in found if course.used_ns and course.tiles):
+        used, told = hour_of(course.used_ns), []
+        for span in ((hour_of(course.asked_ns) - round(settings.recent_days * 24), used), (used + 1, 1 << 60)):
+            total, sums = Counters(), store.fleet.counters_of(site, "tile", *span)
+            for tile in course.tiles:
+                total.add(sums.get(tile, Counters()))
+            share = kpis(total).localised_share_of_all
+            driven = f"{total.position_failures} in {driven_words(total.robot_days)}"
+            told.append(driven + ("" if share is None else f", localised {share:.1%}"))
+        course.effect = f"before {told[0]}; since {told[1]}"
+    return found
 
 
 def _asked(requests: Sequence[SurveyRequest], size_m: float) -> dict[str, list[str]]:

@@ -30,7 +30,7 @@ _QUANTILES = (np.arange(400) + 0.5) / 400
 class CanarySettings(Section, frozen=True):
     """Choice and decision of a canary. The margin: margin_ratio times the others' rate plus margin_per_robot_day.
 
-    share: of the robots, if a command gives none.
+    share: of the robots, if a command gives none. builds: versions of nights and of robots' drives begin as canaries.
     """
 
     share: Probability = 0.05
@@ -38,6 +38,7 @@ class CanarySettings(Section, frozen=True):
     margin_per_robot_day: Annotated[float, msgspec.Meta(ge=0)] = 0.5
     min_robot_days: Positive = 3.0
     max_days: Positive = 7.0
+    builds: bool = False
 
 
 @dataclass(frozen=True, slots=True)

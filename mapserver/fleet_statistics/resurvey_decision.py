@@ -25,6 +25,7 @@ class ResurveySettings(Section, frozen=True):
     """Recent and earlier periods, and thresholds of worsening.
 
     rising_ratio: factor by which the earlier rate must be exceeded, at a significance of 1 %; fading: drop of the share of found landmarks.
+    requests: the server itself requests surveys of what is listed.
     """
 
     recent_days: Positive = 2.0
@@ -32,6 +33,7 @@ class ResurveySettings(Section, frozen=True):
     min_failures: Annotated[int, msgspec.Meta(ge=1)] = 3
     rising_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
     fading: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.15
+    requests: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Polygons requested for a new survey, as stored for a site, and the covered share of one. Pure."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -14,7 +14,7 @@ from fleetmap.geometry import Array, inside_rings
 KIND = "survey request "
 """Prefix of a request's kind among the files of a site; its id follows."""
 
-ASKED, DRIVEN, IN_USE = "asked for ", "driven by ", "done: version "
+ASKED, DRIVEN, IN_USE, EFFECT, TILES = "asked for ", "driven by ", "done: version ", "failures there: ", ", tiles "
 """How the entries of a request in the site's log begin."""
 
 COVERED_SHARE = 0.9
@@ -53,15 +53,19 @@ class SurveyRequest:
         return float(np.mean(near_drives(inside, driven_map_m))) if len(inside) else 0.0
 
 
-class SurveyCourse(msgspec.Struct):
-    """What became of a request: when it was made, driven by robots, and in use by a version; 0 if it was not yet."""
+@dataclass(slots=True)
+class SurveyCourse:
+    """When a request was made, driven, in use by a version, its effect logged; 0 if not yet. effect: failures there before and since."""
 
     id: str
-    place: str = ""
-    asked_ns: int = 0
+    place: str
+    asked_ns: int
+    tiles: list[str]
     driven_ns: int = 0
-    robots: list[str] = []
+    robots: list[str] = field(default_factory=list)
     used_ns: int = 0
+    told_ns: int = 0
+    effect: str = ""
 
 
 def courses(events: Iterable[tuple[int, str, str]]) -> list[SurveyCourse]:
@@ -70,14 +74,16 @@ def courses(events: Iterable[tuple[int, str, str]]) -> list[SurveyCourse]:
     for stamp_ns, kind, words in events:
         if not kind.startswith(KIND):
             continue
-        name = kind.removeprefix(KIND)
         if words.startswith(ASKED):
-            found[name] = SurveyCourse(name, words.removeprefix(ASKED), stamp_ns)
-        elif (course := found.get(name)) is not None and words.startswith(DRIVEN):
+            place, _, tiles = words.removeprefix(ASKED).partition(TILES)
+            found[kind] = SurveyCourse(kind.removeprefix(KIND), place, stamp_ns, tiles.split())
+        elif (course := found.get(kind)) is not None and words.startswith(DRIVEN):
             course.driven_ns = course.driven_ns or stamp_ns
             course.robots = sorted({*course.robots, words.removeprefix(DRIVEN)})
         elif course is not None and words.startswith(IN_USE):
             course.used_ns = stamp_ns
+        elif course is not None and words.startswith(EFFECT):
+            course.told_ns = stamp_ns
     return list(found.values())[::-1]
 
 

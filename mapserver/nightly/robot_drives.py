@@ -38,8 +38,9 @@ class _Drive:
 class RobotDrives:
     """Receives parts in order, and starts a night once a drive is in. Methods may be called from any thread."""
 
-    def __init__(self, store: MapStore, nights: NightRuns) -> None:
-        self._store, self._nights, self._lock = store, nights, threading.Lock()
+    def __init__(self, store: MapStore, nights: NightRuns, *, waits: bool = False) -> None:
+        """waits: drives at a site with a version on trial wait for its end, as `[canary] builds` asks for."""
+        self._store, self._nights, self._waits, self._lock = store, nights, waits, threading.Lock()
         self._drives: dict[tuple[str, str], _Drive] = {}
         self._rates = RateLimit(DRIVE_BURST, DRIVES_PER_S, store.now_ns)
         self._site_rates = RateLimit(SITE_BURST, SITE_DRIVES_PER_S, store.now_ns)
@@ -86,7 +87,8 @@ class RobotDrives:
         robots that fell silent are dropped."""
         with self._lock:
             self._drop_idle(self._store.now_ns())
-        for inbox in sorted(self._nights.inbox.glob("*")):
+        trials = {trial.site for trial in self._store.canaries(running=True)} if self._waits else set[str]()
+        for inbox in sorted(path for path in self._nights.inbox.glob("*") if path.name not in trials):
             if any(_DRIVE.fullmatch(path.name) for path in arrivals(inbox, SETTLE_S, self._store.now_ns()).complete):
                 try:
                     self._nights.start(inbox.name)

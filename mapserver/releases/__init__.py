@@ -77,6 +77,19 @@ def publish(
     return version
 
 
+def publish_or_try(
+    store: MapStore, site: str, version: int, share: float | None, *, actor: Actor, gate: GateSettings
+) -> str:
+    """Publish a draft, or start its canary with a share of the robots; return what it is then. Errors as of `publish` and `start_canary`.
+
+    It is published without a share, without a current version, and where fewer than two robots were heard of lately.
+    """
+    if share is None or len(_heard_of(store, site)) < 2 or store.current(site) is None:
+        publish(store, site, version, actor=actor, gate=gate)
+        return "current"
+    return f"on trial by {start_canary(store, site, version, share, actor=actor, gate=gate).share:.1%} of the robots"
+
+
 def confirm_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> VersionInfo:
     """Return the draft with an operator's confirmation of its calibrations in its manifest.
 
@@ -176,8 +189,7 @@ def start_canary(
         _pass_gate(store, wanted, actor, gate, force=False)
     else:
         store.check_bytes(wanted)
-    recent_ns = store.now_ns() - _RECENT_NS
-    robots = [robot.robot for robot in store.robots(site) if robot.last_seen_ns >= recent_ns]
+    robots = _heard_of(store, site)
     with _releasing(store, site) as release:
         current = release.rows.current
         if current is None or current.version != base or release.rows.canary is not None:
@@ -188,6 +200,11 @@ def start_canary(
         detail = f"version {version} for {share:.1%} of the robots, beside version {base}"
         release.log("canary_started", detail, version, actor)
     return store.canaries(site, running=True)[0]
+
+
+def _heard_of(store: MapStore, site: str) -> list[str]:
+    recent_ns = store.now_ns() - _RECENT_NS
+    return [robot.robot for robot in store.robots(site) if robot.last_seen_ns >= recent_ns]
 
 
 def end_canary(

@@ -14,7 +14,9 @@ from mapserver.drafting.job_lock import end_interrupted
 from mapserver.fleet.alerts import HEARD_WITHIN_S, AlertSettings, active_alerts, acts_after, end_absent
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.healing import heal
 from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -35,7 +37,7 @@ class BackgroundTask:
 
 
 def server_tasks(
-    store: MapStore, fleet: Fleet, bus_service: BusService, canary: CanarySettings
+    store: MapStore, fleet: Fleet, bus_service: BusService, canary: CanarySettings, resurvey: ResurveySettings
 ) -> list[BackgroundTask]:
     """Return all background tasks of a server."""
 
@@ -61,6 +63,7 @@ def server_tasks(
         BackgroundTask(
             "searching for killed jobs", 20.0, alone(lambda: end_interrupted(store, time.time_ns()), "jobs")
         ),
+        BackgroundTask("healing", 600.0, alone(lambda: heal(store, resurvey, time.time_ns()), "healing")),
         BackgroundTask("looking at canaries", 10.0, alone(lambda: review(store, canary, time.time_ns()), "canaries")),
     ]
 

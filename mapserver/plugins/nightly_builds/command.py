@@ -36,9 +36,9 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
 
     FrameSelection.parse(options.frames)
     settings, build = settings_of(context), options.build_options(context, report=None)
-    retention = settings.ingest.retention()
+    retention, trial = settings.ingest.retention(), settings.canary.share if settings.canary.builds else None
     request = NightRequest(
-        options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build, retention
+        options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build, retention, trial
     )
     try:
         sentence = run_night(request, settings.gate, plain_console(stderr=True))

@@ -43,7 +43,8 @@ _ENDED = (
 
 
 class NightRequest(NamedTuple):
-    """Options of `mapserver nightly`. now_ns: the time against which `settle_s` is checked; retention: applied before the work."""
+    """Options of `mapserver nightly`. now_ns: for `settle_s`; retention: applied before the work; trial_share: of the robots, which try
+    each version first, None: versions become current at once."""
 
     site: str
     inbox: Path
@@ -52,6 +53,7 @@ class NightRequest(NamedTuple):
     settle_s: float = 300.0
     options: BuildOptions = BuildOptions()
     retention: FleetRetention = FleetRetention()
+    trial_share: float | None = None
 
 
 class NightReport(Struct):
@@ -223,6 +225,10 @@ class _Night:
         groups = [[r for r in recordings if [r] not in alone], *alone]
         failed, published = None, len(self._report.published)
         for group in filter(None, groups):
+            if self._request.trial_share and (trials := self._maps.canaries(self._request.site, running=True)):
+                for recorded in group:
+                    self._wait(recorded.path.name, f"not yet: version {trials[0].version} is on trial")
+                continue
             try:
                 self._build(group)
             except (RecordingError, SurveyError, GateRefusedError) as error:
@@ -283,13 +289,14 @@ class _Night:
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
         own = [recorded for recorded in recordings if recorded.sha256 in taken]
         try:
-            releases.publish(self._maps, site, version, actor=self._actor(), gate=self._gate)
+            share, gate = self._request.trial_share, self._gate
+            state = releases.publish_or_try(self._maps, site, version, share, actor=self._actor(), gate=gate)
         except GateRefusedError as error:
             if len(own) == 1:
                 self._put_away(own[0].path, boxes.HELD, own[0].sha256, str(error))
             raise
         self._report.published.append(version)
-        self._say(f"site {site}: version {version} is current")
+        self._say(f"site {site}: version {version} is {state}")
         for recorded in own:
             self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {version}")
 

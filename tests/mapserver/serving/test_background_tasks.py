@@ -11,6 +11,7 @@ from fleetmap.messages import RobotHealth
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -67,7 +68,13 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
         for number in range(8):
             at_ns = store.canaries()[0].started_ns + NS
             fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=at_ns, cause="changed", version=2))
-        run_for([replace(task, every_s=0.05) for task in server_tasks(store, fleet, service, CanarySettings())], 2.0)
+        run_for(
+            [
+                replace(task, every_s=0.05)
+                for task in server_tasks(store, fleet, service, CanarySettings(), ResurveySettings())
+            ],
+            2.0,
+        )
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary
         assert "8 failures in" in canary.outcome

@@ -157,6 +157,20 @@ def test_what_came_in_becomes_a_version_once(hall: Path) -> None:
         assert [event.actor for event in maps.events("hall") if event.kind == "published"] == ["nightly"]
 
 
+def test_some_robots_try_a_nights_version_first(hall: Path) -> None:
+    assert "version 1 published" in spend(hall, trial_share=0.5), "there is no other one to compare it with"
+    with MapStore.open(hall / "store") as maps:
+        for robot in ("r1", "r2"):
+            maps.record_robot_report("hall", robot, {})
+    record(hall / "inbox", "wednesday", 2)
+    assert "version 2 published, 1 done" in spend(hall, trial_share=0.5)
+    assert [state for state, _ in states(hall)] == ["current", "published"]
+    record(hall / "inbox", "thursday", 3)
+    assert spend(hall, trial_share=0.5) == "site hall: nothing new"
+    (told,) = last_report(hall / "store", "hall")["waiting"]
+    assert told == {"name": "thursday", "reason": "not yet: version 2 is on trial"}
+
+
 def test_each_recording_goes_where_it_belongs_with_its_reason(hall: Path) -> None:
     record(hall / "inbox", "lost one", 7)
     dark = record(hall / "inbox", "dark one", 8)
