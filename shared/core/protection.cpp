@@ -7,6 +7,7 @@
 #include <limits>
 #include <map>
 #include <numbers>
+#include <set>
 #include <vector>
 
 #include "dense.h"
@@ -14,24 +15,27 @@
 namespace fleetmap {
 namespace {
 
-constexpr double kOften = 1e-2, kSeldom = 1e-3;            // priors of faults, for each fix
-constexpr double kWhite = 1.6;                             // variance of matches' independent errors, over what they state
-constexpr double kOverbound = 1.56;                        // of a mode's covariance: tails are heavier than a Gaussian's
-constexpr double kAnywhereRad = 1.0, kAnywhereM = 30.0;    // sigmas of a mode that knows nothing
-constexpr double kForgottenS = 20.0;                       // after a group was last seen
-constexpr double kCellM = 2.0, kZoneM = 8.0, kLowM = 1.0;  // squares of the map; the height above the base that divides it
-constexpr int kColumns = 4, kRows = 3;                     // parts of the image
-constexpr double kFarthest = 1e7;                          // metres, and pixels
+constexpr double kOften = 1e-2, kSeldom = 1e-3, kBay = 5e-2;  // priors of faults, for each fix
+constexpr double kWhite = 1.6;                                // variance of matches' independent errors, over what they state
+constexpr double kOverbound = 1.56;                           // of a mode's covariance: tails are heavier than a Gaussian's
+constexpr double kAnywhereRad = 1.0, kAnywhereM = 30.0;       // sigmas of a mode that knows nothing
+constexpr double kForgottenS = 20.0;                          // after a group was last seen
+constexpr double kCellM = 2.0, kZoneM = 8.0, kLowM = 1.0;     // squares of the map; the height above the base that divides it
+constexpr int kColumns = 4, kRows = 3;                        // parts of the image
+constexpr double kNearest = 0.05;                             // metres before the camera
+constexpr int kRounds = 2;                                    // of an update
+constexpr double kFarthest = 1e7;                             // metres, and pixels
 constexpr double kUnknown = std::numeric_limits<double>::infinity();
 
-// What a mode never used, with the number of a part of the image or of the map. The first three are of one fix: the next makes them anew.
-enum class Without { kFix, kAllBefore, kMatch, kNothing, kDisparities, kSide, kHalf, kDepth, kHeight, kImage, kCell, kZone };
+// What a mode never used, with the number of a part of the image or of the map. The first two are of one fix: the next makes them anew.
+enum class Without { kFix, kAllBefore, kNothing, kDisparities, kSide, kHalf, kDepth, kHeight, kImage, kCell, kZone };
 struct Group {
   Without what;
   int column = 0, row = 0;
   auto operator<=>(const Group&) const = default;
 };
-double prior_of(Without what) { return what == Without::kMatch || what == Without::kImage || what == Without::kCell ? kOften : kSeldom; }
+// Of a square: the stock of a bay, or one match or landmark in it.
+double prior_of(Without what) { return what == Without::kCell ? kBay : what == Without::kImage ? kOften : kSeldom; }
 
 // A filter of the pose; its perturbation is that of compose_pose.
 struct Mode {
@@ -41,17 +45,10 @@ struct Mode {
   double seen_s;
 };
 
-// The normal equations of matches on a perturbation of the fix: information, and in the last column the gradient of the cost.
-struct Sums {
-  double at[42]{};
-
-  void add(const double* row, double weight) {
-    for (int a = 0; a < 6; ++a)
-      for (int b = 0; b < 7; ++b) at[7 * a + b] += weight * row[a] * row[b];
-  }
-  void add(const Sums& other, double sign = 1.0) {
-    for (int k = 0; k < 42; ++k) at[k] += sign * other.at[k];
-  }
+// What a match says of a perturbation of the fix: residuals by rows (u, v, disparity), whitened, their derivatives before them.
+struct Match {
+  double rows[3][7];
+  Group groups[10];
 };
 
 // The inverse of a symmetric positive definite matrix; not finite where it is none.
@@ -106,21 +103,47 @@ void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
   mode.map_from_body = mode.map_from_body * way;
 }
 
-// Updates a mode by a fix: by the perturbation of the fix's pose that minimises the sum of both costs.
-void update(Mode& mode, const SE3& fix, const Sums& sums) {
+// Updates a mode by the matches outside its group: by the perturbation of the fix's pose that minimises the sum of both costs. Which of
+// them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. True if the group is in view.
+bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const Refinement& refinement) {
   const Mat6 before = inverse_spd(mode.covariance);
-  Mat6 information = before;
-  double off[6], slope[6], step[6] = {};
+  const double square = refinement.width * refinement.width;
+  double off[6], at[6];
   store(so3_log(mode.map_from_body.rotation * transposed(fix.rotation)), off);
   store(mode.map_from_body.translation - fix.translation, off + 3);
-  for (int a = 0; a < 6; ++a) {
-    slope[a] = -sums.at[7 * a + 6];
-    for (int b = 0; b < 6; ++b) slope[a] += before[a][b] * off[b], information[a][b] += sums.at[7 * a + b];
+  std::copy_n(off, 6, at);
+  bool is_seen = mode.group.what < Without::kSide;
+  for (int round = 0; round < kRounds; ++round) {
+    Mat6 information = before;
+    double slope[6] = {};
+    for (int a = 0; a < 6; ++a)
+      for (int b = 0; b < 6; ++b) slope[a] += before[a][b] * off[b];
+    for (const Match& match : matches) {
+      const bool is_left_out = std::find(match.groups, std::end(match.groups), mode.group) != std::end(match.groups);
+      is_seen |= is_left_out;
+      if (is_left_out) continue;
+      double squared = 0.0;
+      for (const double* const row : match.rows) {
+        double residual = row[6];
+        for (int a = 0; a < 6; ++a) residual += row[a] * at[a];
+        squared += residual * residual;
+      }
+      if (!(squared < refinement.gate_squared)) continue;
+      const double robust = square / (square + squared), weight = robust * robust / kWhite;
+      for (int k = 0; k < (mode.group.what == Without::kDisparities ? 2 : 3); ++k)
+        for (int a = 0; a < 6; ++a) {
+          slope[a] -= weight * match.rows[k][a] * match.rows[k][6];
+          for (int b = 0; b < 6; ++b) information[a][b] += weight * match.rows[k][a] * match.rows[k][b];
+        }
+    }
+    mode.covariance = inverse_spd(information);
+    for (int a = 0; a < 6; ++a) {
+      at[a] = 0.0;
+      for (int b = 0; b < 6; ++b) at[a] += mode.covariance[a][b] * slope[b];
+    }
   }
-  mode.covariance = inverse_spd(information);
-  for (int a = 0; a < 6; ++a)
-    for (int b = 0; b < 6; ++b) step[a] += mode.covariance[a][b] * slope[b];
-  mode.map_from_body = {so3_exp(vec3(step)) * fix.rotation, fix.translation + vec3(step + 3)};
+  mode.map_from_body = {so3_exp(vec3(at)) * fix.rotation, fix.translation + vec3(at + 3)};
+  return is_seen;
 }
 
 double median(std::vector<double> values) {
@@ -139,68 +162,55 @@ class ProtectionBank {
     for (Mode& mode : modes_) move(mode, way, cov_way);
     Mode anywhere{{Without::kAllBefore}, fix, {}, stamp_s};
     for (int a = 0; a < 6; ++a) anywhere.covariance[a][a] = a < 3 ? kAnywhereRad * kAnywhereRad : kAnywhereM * kAnywhereM;
-    Mode before = modes_.empty() ? anywhere : modes_[0];
-    std::map<Group, Sums> groups{{{Without::kNothing}, {}}};
-    std::vector<Sums> matches;
-    Sums all;
+    const Mode before = modes_.empty() ? anywhere : modes_[0];
     const Sightings seen = sightings_of(points, pixels, weights);
     const Refinement refinement = refinement_of(limits);
     const SE3 map_from_cam = fix * body_from_cam, cam_from_map = inverse(map_from_cam);
     const auto [width_px, height_px] = size_px;
+    if (!(width_px >= 1.0 && height_px >= 1.0)) throw nb::value_error("size_px: from 1");
     std::vector<double> us, vs, depths;
     for (size_t n = 0; n < seen.count; ++n) {
       us.push_back(seen.pixels[n][0]), vs.push_back(seen.pixels[n][1]), depths.push_back((cam_from_map * seen.points[n])[2]);
       if (!(norm(seen.points[n]) < kFarthest && std::hypot(us[n], vs[n]) < kFarthest && std::isfinite(depths[n])))
         throw nb::value_error("points, pixels, poses: finite, below 1e7");
     }
-    if (!(width_px >= 1.0 && height_px >= 1.0)) throw nb::value_error("size_px: from 1");
-    const double middle_u = median(us), middle_v = median(vs), middle_depth = median(depths), square = refinement.width * refinement.width;
+    const double middle_u = median(us), middle_v = median(vs), middle_depth = median(depths);
+    std::vector<Match> matches;
+    std::set<Group> groups{{Without::kNothing}, {Without::kDisparities}};
     for (size_t n = 0; n < seen.count; ++n) {
-      const Vec3 point = seen.points[n], pixel = seen.pixels[n], in_cam = cam_from_map * point;
-      const auto [residual, by_point] = residuals_of(in_cam, pixel, seen.weights[n], lens);
-      const double squared = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
-      if (!(in_cam[2] > 0.0 && squared < refinement.gate_squared)) continue;
-      const double robust = square / (square + squared);
-      Sums match, disparity;
-      for (int k = 0; k < 3; ++k) {  // where the body turns and shifts, the point moves against it
-        double row[7];
-        const Vec3 by_map = map_from_cam.rotation * by_point[k];
-        store(cross(by_map, point - fix.translation), row), store(-by_map, row + 3), row[6] = residual[k];
-        (k < 2 ? match : disparity).add(row, robust * robust / kWhite);
-      }
-      groups[{Without::kDisparities}].add(disparity);
-      match.add(disparity), all.add(match), matches.push_back(match);
+      const Vec3 point = seen.points[n], pixel = seen.pixels[n];
+      if (!(depths[n] > kNearest)) continue;
+      const auto [residual, by_point] = residuals_of(cam_from_map * point, pixel, seen.weights[n], lens);
       const auto part = [](double at, double size, int count) { return std::clamp(int(std::floor(at / size * count)), 0, count - 1); };
       const auto tile = [&](int axis, double size_m) { return int(std::floor(point[axis] / size_m)); };
-      groups[{Without::kSide, pixel[0] < middle_u}].add(match), groups[{Without::kHalf, pixel[1] < middle_v}].add(match);
-      groups[{Without::kDepth, in_cam[2] < middle_depth}].add(match), groups[{Without::kHeight, point[2] < base_z_m + kLowM}].add(match);
-      groups[{Without::kImage, part(pixel[0], width_px, kColumns), part(pixel[1], height_px, kRows)}].add(match);
-      groups[{Without::kCell, tile(0, kCellM), tile(1, kCellM)}].add(match);
-      for (int k = 0; k < 4; ++k)  // zones overlap by halves: what one of them can hold, no border cuts
-        groups[{Without::kZone, tile(0, 0.5 * kZoneM) - k / 2, tile(1, 0.5 * kZoneM) - k % 2}].add(match);
+      const int column = tile(0, 0.5 * kZoneM), row = tile(1, 0.5 * kZoneM);  // zones overlap by halves: no border cuts a short stretch
+      Match match{{},
+                  {{Without::kSide, pixel[0] < middle_u},
+                   {Without::kHalf, pixel[1] < middle_v},
+                   {Without::kDepth, depths[n] < middle_depth},
+                   {Without::kHeight, point[2] < base_z_m + kLowM},
+                   {Without::kImage, part(pixel[0], width_px, kColumns), part(pixel[1], height_px, kRows)},
+                   {Without::kCell, tile(0, kCellM), tile(1, kCellM)},
+                   {}}};
+      for (int k = 0; k < 4; ++k) match.groups[6 + k] = {Without::kZone, column - k / 2, row - k % 2};
+      for (int k = 0; k < 3; ++k) {  // where the body turns and shifts, the point moves against it
+        const Vec3 by_map = map_from_cam.rotation * by_point[k];
+        store(cross(by_map, point - fix.translation), match.rows[k]), store(-by_map, match.rows[k] + 3);
+        match.rows[k][6] = residual[k];
+      }
+      matches.push_back(match), groups.insert(match.groups, std::end(match.groups));
     }
-    const auto updated = [&](Mode& mode, const Sums& left_out) {
-      Sums used = all;
-      used.add(left_out, -1.0);
-      fleetmap::update(mode, fix, used);
-    };
-    for (Mode& mode : modes_) {
-      const auto found = groups.extract(mode.group);
-      if (found) mode.seen_s = stamp_s;
-      updated(mode, found ? found.mapped() : Sums{});
-    }
-    const auto add_mode = [&](const Mode& from, Group group, const Sums& left_out) {
-      modes_.push_back({group, from.map_from_body, from.covariance, stamp_s});
-      updated(modes_.back(), left_out);
-    };
-    for (const auto& [group, left_out] : groups) add_mode(before, group, left_out);  // first seen: all before was without it
-    add_mode(anywhere, anywhere.group, {});
-    add_mode(before, {Without::kFix}, all);
-    for (const Sums& match : matches) add_mode(before, {Without::kMatch}, match);
+    for (const Mode& mode : modes_) groups.erase(mode.group);
+    for (const Group& group : groups)  // first seen: all before was without it
+      modes_.push_back({group, before.map_from_body, before.covariance, stamp_s});
+    modes_.push_back(anywhere);
+    for (Mode& mode : modes_)
+      if (fleetmap::update(mode, fix, matches, refinement)) mode.seen_s = stamp_s;
+    modes_.push_back({{Without::kFix}, before.map_from_body, before.covariance, stamp_s});
   }
 
-  // Levels of position and rotation, metres and radians, of a published pose; way: since the last fix; cov_map: of the map's own error. The
-  // position is that of the body and of a point of it, in its axes. Infinite without a fix.
+  // Levels of position and rotation, metres and radians, of a published pose; way: since the last fix; cov_map: of the map's own error.
+  // The position is that of the body and of a point of it, in its axes. Infinite without a fix.
   std::tuple<double, double> level(const SE3& map_from_body, const SE3& way, const Mat6& cov_way, const Mat6& cov_map, Vec3 point,
                                    double risk) const {
     if (!(risk > 0.0 && risk < 1.0)) throw nb::value_error("risk: above 0, below 1");
