@@ -265,6 +265,7 @@ def refine(
     first: GlobalMatch, settings: SurveySettings, tools: SurveyTools
 ) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
     """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera."""
+    tools.images.release()
     yaws = _stereo_yaws(first.state, first.redundant, settings)
     tools.at("global adjustment", 1, 2)
     odometry, redundant, rounds = _with_depths(first.odometry, first.state, first.depths), first.redundant, 2

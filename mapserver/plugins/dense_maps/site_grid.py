@@ -80,7 +80,9 @@ class SessionViews:
         reach = np.arange(-_WIDTH_M / 2, _WIDTH_M / 2 + 1e-9, CELL_M / 2)
         disc = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 1, 2)
         disc = disc[np.linalg.norm(disc[:, 0], axis=1) <= _WIDTH_M / 2]
-        keys = np.unique(np.floor((way.reshape(-1, 2) + disc).reshape(-1, 2) / CELL_M).astype(np.int64) @ [1 << 32, 1])
+        # Step by step: at once a kilometre takes half a gigabyte
+        ways = [np.unique(np.floor((step + disc) / CELL_M) @ [1 << 32, 1]) for step in way.swapaxes(0, 1)]
+        keys = np.unique(np.concatenate([[], *ways])).astype(np.int64)
         x = (keys + (1 << 31)) >> 32  # back to two halves: unique on integers is thirty times faster than on rows
         cells = np.stack([x, keys - (x << 32)], axis=-1)
         levels = int(np.clip(np.ceil((floor_m - FLOOR_M) / SLICE_M), 0, SLICES))
