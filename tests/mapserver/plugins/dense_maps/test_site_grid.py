@@ -82,9 +82,14 @@ def test_rays_as_by_brute_force(seed: int) -> None:
 
 
 def wall_views(
-    wall_x_m: float, places_x_m: Array, *, wall: bool = True, before: Mapping[tuple[int, int], Counts] | None = None
+    wall_x_m: float,
+    places_x_m: Array,
+    *,
+    wall: bool = True,
+    high_m: float = 1.2,
+    before: Mapping[tuple[int, int], Counts] | None = None,
 ) -> SessionViews:
-    """A camera that drives along x towards a wall 1.2 m high across its way, over a floor that a hall ends at x = 9 m."""
+    """A camera that drives along x towards a wall so high across its way, over a floor that a hall ends at x = 9 m."""
     views, lens = SessionViews(before or {}), StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
     v, u = np.mgrid[0:480:STEP_PX, 0:640:STEP_PX]
     across, down = (u - lens.cx_px) / lens.focal_px, (v - lens.cy_px) / lens.focal_px
@@ -93,7 +98,7 @@ def wall_views(
             depth = np.minimum(np.where(down > 0, HEIGHT_M / down, np.inf), 9.0 - x)
         to_wall = wall_x_m - x
         height_m = HEIGHT_M - down * to_wall
-        hits = wall & (to_wall > 0) & (height_m > 0) & (height_m < 1.2) & (np.abs(across * to_wall) < 2)
+        hits = wall & (to_wall > 0) & (height_m > 0) & (height_m < high_m) & (np.abs(across * to_wall) < 2)
         depth = np.where(hits, np.minimum(depth, to_wall), depth)
         disparity = np.where(np.isfinite(depth), lens.focal_px * lens.baseline_m / depth, np.nan).astype(np.float32)
         map_from_cam = se3(OPTICAL, np.array([x, 0.02, 5.0 + HEIGHT_M]))
@@ -118,6 +123,16 @@ def test_a_wall_is_occupied_before_it_is_free_and_behind_it_unknown() -> None:
     column, row = ((np.array([5.02, 0.0]) - where.map_from_grid[:2, 3]) / CELL_M).astype(int)
     assert surfaces[1, row, column] == pytest.approx(1.2, abs=0.03)
     assert abs(surfaces[1, row, column - 40]) < 0.03
+
+
+def test_what_many_look_over_stands_where_some_see_it() -> None:
+    """An empty pallet: rays from afar pass over it, in the same voxels."""
+    views = wall_views(5.02, np.arange(-4.0, 2.75, 0.25), high_m=0.16)
+    assert cell(occupancy(updated(views), 1.1), 5.02, 0.0) == 100
+    hits, passes = (views.tiles[0, 0][i][0, 100, 0] for i in (0, 1))
+    assert 3 <= hits <= 6 and passes > 2 * hits
+    gone = wall_views(5.02, np.arange(-4.0, 2.75, 0.25), wall=False, before=updated(views))
+    assert cell(occupancy(updated(gone), 1.1), 5.02, 0.0) == 0
 
 
 def test_what_is_gone_the_next_night_is_free_and_what_was_not_seen_stays() -> None:
