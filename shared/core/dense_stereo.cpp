@@ -81,7 +81,7 @@ std::vector<int16_t> slopes_of(GreyImage picture) {
 
 inline uint8_t limited(int16_t slope) { return uint8_t(std::clamp<int16_t>(slope, -kMostSlope, kMostSlope) + kMostSlope); }
 
-// kFractions of a pixel for each sample, 0 unknown. range: disparities below are compared, a multiple of kLanes.
+// kFractions of a pixel for each sample, 0 unknown. range: disparities below are compared, the last only beside its neighbour; of kLanes.
 std::vector<int16_t> match(GreyImage left, GreyImage right, ptrdiff_t range) {
   const ptrdiff_t width = left.width, rows = (left.height + kStepPx - 1) / kStepPx, columns = (width + kStepPx - 1) / kStepPx;
   std::vector<int16_t> found(size_t(rows * columns), 0);
@@ -165,7 +165,7 @@ auto match_densely(const Image& left, const Image& right, double farthest_px) {
   if (!(farthest_px >= 0.0 && farthest_px <= kMostRange - kLanes)) throw nb::value_error("farthest_px: from 0 to 1008");
   const size_t rows = (left.shape(0) + kStepPx - 1) / kStepPx, columns = (left.shape(1) + kStepPx - 1) / kStepPx;
   std::vector<int16_t> found;
-  if (rows > 0 && columns > 0) unlocked([&] { found = match(left, right, (ptrdiff_t(farthest_px) / kLanes + 1) * kLanes); });
+  if (rows > 0 && columns > 0) unlocked([&] { found = match(left, right, (ptrdiff_t(farthest_px + 1.0) / kLanes + 1) * kLanes); });
   return as_numpy<int16_t, 2>(std::move(found), {rows, columns});
 }
 

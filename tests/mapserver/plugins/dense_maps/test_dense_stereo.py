@@ -37,3 +37,11 @@ def test_a_board_before_a_wall_stands_where_it_is_and_what_is_hidden_is_unknown(
     assert not is_known[:, :32].any(), "where the nearest would be outside of the right picture"
     assert is_known[44:76, 62:69].mean() < 0.5, "hidden"
     assert np.median(np.abs(found - true)[is_known]) < DENSE_SIGMA_PX
+
+
+def test_the_last_disparity_of_a_range_is_found() -> None:
+    """31 px fill two registers of the matcher."""
+    wall = cv2.GaussianBlur(np.random.default_rng(4).uniform(0, 255, (60, 240)).astype(np.float32), (0, 0), 1.5)
+    wall = np.clip(128 + 4 * (wall - 128), 0, 255).astype(np.uint8)
+    found = core.match_densely(wall[:, :200].copy(), wall[:, 31:231].copy(), 31.0)[:, 30:] / core.DENSE_FRACTIONS
+    assert (np.abs(found - 31.0) < DENSE_SIGMA_PX).mean() > 0.95
