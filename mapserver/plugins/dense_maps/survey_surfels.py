@@ -94,7 +94,8 @@ class SurfelGrower:
         before, images = self.surfels, _Images(self._looks, self._camera)
         exposure = self._exposure(images)
         grown = {place: self._grown(place, images, exposure) for place in sorted(self._seen)}
-        old = {place: self._left(place, images) for place in before.tiles if images.near(place)}
+        near = [p for p in before.tiles if (off_tile_m(np.array(p), TILE_SIZE_M, images.places) < MAX_RANGE_M).any()]
+        old = {place: self._left(place, images) for place in near}
         shift = self._brightness_shift([(old[place], grown[place]) for place in sorted(old.keys() & grown.keys())])
         tiles = dict(before.tiles)
         for place in sorted({*old, *grown}):
@@ -180,9 +181,8 @@ class SurfelGrower:
         shifts = [np.zeros(0)]
         for old, new in tiles:
             voxels = (core.voxel_keys(surfels.points_map, surfels.levels) for surfels in (old, new))
-            (keys, first), (others, second) = (np.unique(keys, return_index=True) for keys in voxels)
-            _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
-            before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
+            _, mine, theirs = np.intersect1d(*voxels, return_indices=True)
+            before, after = old.greys[mine].astype(np.float64), new.greys[theirs].astype(np.float64)
             sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
             shifts.append(np.log(before[sure] / after[sure])[::_LOGS_STEP])
             self._images.release()
@@ -210,16 +210,12 @@ class _Images:
         right, below, focal = camera.width_px - camera.cx_px, camera.height_px - camera.cy_px, camera.focal_px
         sides = np.array([[focal, 0, left], [-focal, 0, right], [0, focal, above], [0, -focal, below]])  # inwards
         self._normals = np.array([sides @ look.cam_from_map[:3, :3] for look in looks]).reshape(-1, 4, 3)
-        self._places = np.array([look.map_from_cam[:3, 3] for look in looks]).reshape(-1, 3)
-
-    def near(self, place: _Place) -> bool:
-        """Return True if a view may see the tile."""
-        return bool((off_tile_m(np.array(place), TILE_SIZE_M, self._places) < MAX_RANGE_M).any())
+        self.places = np.array([look.map_from_cam[:3, 3] for look in looks]).reshape(-1, 3)
 
     def seeing(self, points_map: NDArray[np.float32]) -> list[int]:
         """Return the numbers of the images that may see some of these points (N, 3)."""
         low, high = points_map.min(axis=0).astype(np.float64), points_map.max(axis=0).astype(np.float64)
-        middle, half = (low + high) / 2 - self._places, (high - low) / 2
+        middle, half = (low + high) / 2 - self.places, (high - low) / 2
         is_near = np.linalg.norm(np.maximum(np.abs(middle) - half, 0.0), axis=1) < MAX_RANGE_M
         farthest = (self._normals @ middle[:, :, None])[..., 0] + np.abs(self._normals) @ half
         return np.flatnonzero(is_near & (farthest > 0).all(axis=1)).tolist()
@@ -253,10 +249,7 @@ def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[
     """Return (N,) True if `other` has the same place, or the one in front of or behind it, at least `finer_by` levels finer."""
     known = np.zeros(len(surfels), bool)
     for level in range(LEVELS):
-        mine = np.flatnonzero(surfels.levels == level)
-        finer = np.flatnonzero(other.levels >= 0) if not len(mine) else np.flatnonzero(other.levels + finer_by <= level)
-        if not len(mine) or not len(finer):
-            continue
+        mine, finer = np.flatnonzero(surfels.levels == level), other.levels + finer_by <= level
         held, counts = np.unique(_keys(other.points_map[finer], level), return_counts=True)
         held = held[counts >= (_MIN_FINER if finer_by else 1)]
         if not len(held):
