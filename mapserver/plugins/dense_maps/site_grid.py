@@ -63,7 +63,7 @@ class SessionViews:
             if tile in self.before:
                 was_free[in_window] = self.before[tile][in_tile][..., 1]
         # The bits common to a cell and its eight neighbours; none at the border
-        for axis in (0, 1):
+        for axis in (0, 1) if was_free.any() else ():
             was_free = was_free & np.roll(was_free, 1, axis) & np.roll(was_free, -1, axis)
         was_free[[0, -1]], was_free[:, [0, -1]] = 0, 0
         window = core.cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free)
