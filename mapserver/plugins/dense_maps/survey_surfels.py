@@ -72,6 +72,7 @@ class SurfelGrower:
         self._camera, self._looks = session.survey.state.rig.camera, list[_Look]()
         self._seen: dict[_Place, list[int]] = {}  # by tile, the images that measured something in it or its halo
         self._images: ImageStore = session.survey.odometry.keyframes[0].images
+        self._images.release()
         return None
 
     def add(self, view: DepthView) -> None:
