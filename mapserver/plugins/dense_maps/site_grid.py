@@ -122,8 +122,8 @@ def updated(images: SessionViews) -> Tiles:
         old = images.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
         # Of a voxel that its highest surface fills in part only so many rays would be in its way.
-        top = (LOWEST_M + HEIGHT_STEP_M * heights[..., 3:] - FLOOR_M) / SLICE_M - np.arange(SLICES)
-        score = HIT * hits.astype(np.int16) - np.round(np.where((top > 0) & (top < 1), top, 1.0) * passes)
+        over = (LOWEST_M + HEIGHT_STEP_M * heights[..., 3:] - FLOOR_M) / SLICE_M - np.arange(SLICES)
+        score = HIT * hits.astype(np.int16) - np.round(np.where((over > 0) & (over < 1), over, 1.0) * passes)
         occupied = (score >= OCCUPIED) | (was_occupied & (score > -AGAINST))
         is_hidden = (hidden >= AGAINST) & (score > -AGAINST)
         free = ~occupied & ((score <= -FREE) | (was_free & (score < AGAINST) & ~is_hidden))

@@ -181,8 +181,8 @@ class SurfelGrower:
         """
         shifts = [np.zeros(0)]
         for old, new in tiles:
-            voxels = (core.voxel_keys(surfels.points_map, surfels.levels) for surfels in (old, new))
-            _, mine, theirs = np.intersect1d(*voxels, return_indices=True)
+            keys, others = (core.voxel_keys(surfels.points_map, surfels.levels) for surfels in (old, new))
+            _, mine, theirs = np.intersect1d(keys, others, return_indices=True)
             before, after = old.greys[mine].astype(np.float64), new.greys[theirs].astype(np.float64)
             sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
             shifts.append(np.log(before[sure] / after[sure])[::_LOGS_STEP])
