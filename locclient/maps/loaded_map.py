@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.config import Section
 from fleetmap.geometry import Array
-from fleetmap.mapformat.manifest import Manifest
+from fleetmap.mapformat.manifest import Manifest, map_errors_of
 from fleetmap.mapformat.tile import Tile, off_tile_m
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
@@ -103,7 +103,8 @@ class LoadedMap:
     def show(self, localizer: Localizer, site: str = "") -> None:
         """Let a localizer use it as the map of a site of its building; empty: of the robot's own."""
         view = MapView(self.tiles.values(), self.vocabulary, self.manifest.camera.focal_px)
-        localizer.handle_version(self.version, view, self.lookalikes, self.alias_step_m, site)
+        errors = map_errors_of(self.manifest)
+        localizer.handle_version(self.version, view, self.lookalikes, self.alias_step_m, site, errors)
 
     @property
     def alias_step_m(self) -> float:

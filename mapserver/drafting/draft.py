@@ -61,6 +61,7 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import accuracy, truth_from_estimate
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
+from mapserver.quality.map_error import map_errors
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
@@ -272,6 +273,7 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
         surveyed_requests=covered_requests(maps, site, built.joined),
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=alias_step_m(evidence.repetition, known_m),
+        map_errors=map_errors(survey_map, [(tile.tile_x, tile.tile_y) for tile in tiles], TILE_SIZE_M),
     )
     said = to_plain(report) | {key: to_plain(extra.report) for key, extra in extras.items()}
     details = _details(run, built, parent, evidence, said)

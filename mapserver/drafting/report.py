@@ -12,11 +12,13 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
+from fleetmap.mapformat.map_errors import ErrorSigmas
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories, taken
 from mapserver.evaluation.trajectory_error import Accuracy
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
+from mapserver.quality.map_error import error_words
 from mapserver.quality.probes import lookalike_words
 from mapserver.survey.loops.loops import LoopVerdict
 from mapserver.survey.merge.multi_session import MergedMap
@@ -55,6 +57,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     views: SurveyedViews | None = None
     lookalike_recall: float | None = None
     alias_step_m: float | None = None
+    map_errors: dict[str, ErrorSigmas] = {}
     surveyed_requests: dict[str, float] = {}
     removed_landmarks: dict[str, int] = {}
 
@@ -154,6 +157,7 @@ def report_details(built: BuildResult, stage_s: dict[str, float]) -> dict[str, A
 def sentence(site: str, version: int, parent: int | None, report: BuildReport, store: Path) -> str:
     """Return text on a draft stored in the folder `store`; parent: the version that it was built on."""
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
+    ate += f", {error_words(report.map_errors)}"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
     built_on = "" if parent is None else f" on version {parent}"
     left = [s["recording"] for s in report.sessions if not s["joined"]]

@@ -7,6 +7,7 @@ import msgspec
 from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat.building import BUILDING_KEY, BuildingFrame
+from fleetmap.mapformat.map_errors import ErrorSigmas, MapErrors
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 
 T = TypeVar("T")
@@ -17,6 +18,7 @@ MAX_MANIFEST_BYTES = 64 << 20
 Sha256 = Annotated[str, msgspec.Meta(pattern=SHA256_PATTERN.replace("$", r"\Z"))]
 Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN.replace("$", r"\Z"))]
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62))]
+TileName = Annotated[str, msgspec.Meta(pattern=r"^-?\d{1,10},-?\d{1,10}\Z")]
 Positive = Annotated[int, msgspec.Meta(ge=1, le=(1 << 62))]
 
 
@@ -116,12 +118,20 @@ def decode_manifest(data: bytes) -> Manifest:
         )
     manifest = decode_json(data, Manifest, refusal)
     building_frame(manifest)
+    map_errors_of(manifest)
     return manifest
 
 
 def building_frame(manifest: Manifest) -> BuildingFrame | None:
     """The building's frame at the time when the version was made; None if absent. MapFormatError for an invalid one."""
     return manifest_entry(manifest, "configuration", BUILDING_KEY, BuildingFrame)
+
+
+def map_errors_of(manifest: Manifest) -> MapErrors:
+    """The errors of the map that its build measured, none of older builds. MapFormatError for invalid ones."""
+    found = manifest_entry(manifest, "report", "map_errors", dict[TileName, ErrorSigmas]) or {}
+    by_tile = {(int(x), int(y)): sigmas for name, sigmas in found.items() for x, y in [name.split(",")]}
+    return MapErrors(manifest.tile_size_m, by_tile)
 
 
 def manifest_entry(manifest: Manifest, part: Literal["configuration", "report"], key: str, kind: type[T]) -> T | None:

@@ -1,23 +1,25 @@
 """Errors of a map at its places: sigmas of each tile, as the build of the map measured them."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+import msgspec
 import numpy as np
 
 from fleetmap.geometry import Array
 
+Sigma = Annotated[float, msgspec.Meta(gt=0, le=1.0)]
+
 
 class ErrorSigmas(NamedTuple):
-    """Sigmas of the error of a map at a place: rotation about each axis, and position along and across the ground."""
+    """Sigmas of the error of a map at a place: rotation about each axis, and position along each axis of the ground and up."""
 
-    turn_rad: float = 0.006
-    horizontal_m: float = 0.02
-    up_m: float = 0.02
+    turn_rad: Sigma
+    horizontal_m: Sigma
+    up_m: Sigma
 
 
-UNKNOWN_ERROR = ErrorSigmas()
-"""Wide values, for what no build has measured."""
+UNKNOWN_ERROR = ErrorSigmas(0.006, 0.02, 0.02)  # of what no build has measured: wide
 
 
 class MapErrors(NamedTuple):

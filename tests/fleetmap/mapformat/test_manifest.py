@@ -4,6 +4,7 @@ import json
 from typing import Annotated
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +19,7 @@ from fleetmap.mapformat.manifest import (
     TileEntry,
     decode_manifest,
     encode_manifest,
+    map_errors_of,
 )
 from fleetmap.mapformat.names import (
     NAME_PATTERN,
@@ -56,6 +58,16 @@ def test_round_trip_and_sums() -> None:
     assert decode_manifest(data) == MANIFEST
     assert encode_manifest(decode_manifest(data)) == data
     assert (MANIFEST.landmarks, MANIFEST.tile_bytes) == (7, 150)
+
+
+def test_it_says_how_wrong_each_tile_may_be() -> None:
+    told = msgspec.structs.replace(MANIFEST, report={"map_errors": {"0,-1": [0.001, 0.004, 0.002]}})
+    errors = map_errors_of(decode_manifest(encode_manifest(told)))
+    assert errors.sigmas(np.array([3.0, -0.1, 9.0])).tolist() == [0.001] * 3 + [0.004] * 2 + [0.002]
+    assert errors.sigmas(np.array([3.0, 0.1, 0.0])).tolist() == [0.006] * 3 + [0.02] * 3
+    for wrong in ({"0,0": [0.0, 0.004, 0.002]}, {"0,0": [0.001, 0.004]}, {"0;0": [0.1, 0.1, 0.1]}):
+        with pytest.raises(MapFormatError, match="map_errors"):
+            decode_manifest(encode_manifest(msgspec.structs.replace(MANIFEST, report={"map_errors": wrong})))
 
 
 def test_bytes_do_not_depend_on_the_order_of_keys() -> None:

@@ -371,7 +371,6 @@ def test_odometry_that_redefines_its_frame_moves_nothing(tracking: Robot) -> Non
 
 
 def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> None:
-    """Hardly more: on this way its error changes a little."""
     estimate = tracking.ride(40, 0.05)[-1]
     turn_rad, *_, least_m = tracking.localizer.maps.map_sigmas(Place(estimate.map_from_body, estimate.cov_rot_trans))
     assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= 0.7 * least_m

@@ -27,7 +27,7 @@ KEYS = [
     *("loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "scale", "scale_error"),
     *("peak_rss_mb", "findings", "corrections", "culled", "sessions", "joins", "directions"),
     *("starts", "views", "lookalike_recall", "alias_step_m", "grid", "surfels", "pictures", "surveyed_requests"),
-    "removed_landmarks",
+    *("removed_landmarks", "map_errors"),
 ]
 NOT_FOR_ROBOTS = {"map_bytes", "culled", "sessions", "directions", "starts", "views"}
 
