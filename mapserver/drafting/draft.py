@@ -235,7 +235,7 @@ def _survey(
     say_left_out(run.console, run.request.site, surveyed, joined)
     truth = joined_truth(surveyed, joined)
     estimate = joined.map.estimated_trajectory
-    found = accuracy(estimate, len(joined.map.trajectory), truth)
+    found = accuracy(estimate, len(joined.map.trajectory), truth, joined.map.keyframe_stamps_ns)
     if options.frame_from_ground_truth:
         if truth is None or found.rigid is None:
             raise RecordingError(

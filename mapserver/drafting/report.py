@@ -127,8 +127,8 @@ def report_details(built: BuildResult, stage_s: dict[str, float]) -> dict[str, A
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
     and decoding images are part of odometry. frames_seen_in_map: frames located by points of the map; the others by odometry or the
-    IMU. pair_turn, of the first view, and pair_turn_of_views: see survey/bundle/stereo_yaw_check.py. parts: the connected
-    components of each survey; the kept one is in the map.
+    IMU. scale_sigma, worst_step: see evaluation/trajectory_error.py. pair_turn, of the first view, and pair_turn_of_views: see
+    survey/bundle/stereo_yaw_check.py. parts: the connected components of each survey; the kept one is in the map.
     """
     survey_map, surveyed, found = built.joined.map, built.taken, built.accuracy
     first = surveyed[0]
@@ -144,6 +144,8 @@ def report_details(built: BuildResult, stage_s: dict[str, float]) -> dict[str, A
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
+        "scale_sigma": found.scale_sigma,
+        "worst_step": found.worst_step,
         "pair_turn": [to_plain(s.survey.stereo_yaws[0]) for s in surveyed],
         "pair_turn_of_views": [to_plain(s.survey.stereo_yaws) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},

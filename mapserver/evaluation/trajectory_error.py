@@ -10,6 +10,7 @@ from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
+_TENTHS = 10
 MIN_MATCHED = 3  # stamps with ground truth needed for an alignment
 _OPEN_TURN_RAD = np.deg2rad(1.0)  # error of rotations in a motion capture system
 
@@ -97,15 +98,43 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
+def scale_sigma(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """Return the sigma of the scale of an alignment, by leaving out each tenth of the path in turn; None for less than ten stamps.
+
+    Errors of neighbouring stamps depend on each other: tenths do less. Source: Künsch 1989 (jackknife of blocks).
+    """
+    mine, true = paired(estimate, truth)
+    if len(mine) < _TENTHS:
+        return None
+    tenth = np.arange(len(mine)) * _TENTHS // len(mine)
+    kept = [tenth != left_out for left_out in range(_TENTHS)]
+    scales = [align_points(true.positions_m[k], mine.positions_m[k], with_scale=True)[1] for k in kept]
+    return float(np.sqrt(_TENTHS - 1) * np.std(scales))
+
+
+def worst_step(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Return the two stamps, in seconds since the first one, between which the aligned error changes most, and by how much."""
+    mine, true = paired(estimate, truth)
+    if len(mine) < MIN_MATCHED:
+        return {}
+    aligned = transform_points(align_points(true.positions_m, mine.positions_m)[0], mine.positions_m)
+    off_m = np.linalg.norm(np.diff(aligned - true.positions_m, axis=0), axis=1)
+    worst = int(np.argmax(off_m))
+    from_s, to_s = (mine.stamps_ns[worst : worst + 2] - estimate.stamps_ns[0]) * 1e-9
+    return {"from_s": float(from_s), "to_s": float(to_s), "off_m": float(off_m[worst])}
+
+
 class Accuracy(NamedTuple):
-    """A survey against ground truth; all None without one, or if too few stamps have both (see MIN_MATCHED)."""
+    """A survey, and its worst step between keyframes, against ground truth; all None if too few stamps have both (see MIN_MATCHED)."""
 
     rigid: AteResult | None = None
     similarity: AteResult | None = None
     evaluated_share: float | None = None
+    scale_sigma: float | None = None
+    worst_step: dict[str, float] | None = None
 
 
-def accuracy(estimate: Trajectory, frames: int, truth: Trajectory | None) -> Accuracy:
+def accuracy(estimate: Trajectory, frames: int, truth: Trajectory | None, keyframe_stamps_ns: Stamps) -> Accuracy:
     """Return errors of all estimated ones of a survey's frames with a known truth."""
     if truth is None:
         return Accuracy()
@@ -114,7 +143,9 @@ def accuracy(estimate: Trajectory, frames: int, truth: Trajectory | None) -> Acc
         return Accuracy(evaluated_share=matched / max(frames, 1))
     rigid = absolute_trajectory_error(estimate, truth, frames=frames)
     similarity = absolute_trajectory_error(estimate, truth, with_scale=True, frames=frames)
-    return Accuracy(rigid, similarity, rigid.evaluated_share)
+    is_key = np.isin(estimate.stamps_ns, keyframe_stamps_ns)
+    step = worst_step(Trajectory(estimate.stamps_ns[is_key], estimate.frame_from_body[is_key]), truth)
+    return Accuracy(rigid, similarity, rigid.evaluated_share, scale_sigma(estimate, truth), step)
 
 
 def check_truth(what: str, stamps_ns: Stamps, truth: Trajectory | None) -> None:

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inver
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.tum import stamped_lines
 from fleetmap.sensors.samples import Stamps, Trajectory
-from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired, rms
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired, rms, scale_sigma, worst_step
 
 _ROWS, _COLUMNS = np.triu_indices(6)
 
@@ -163,10 +163,10 @@ def summary(
 ) -> Summary:
     """Return all errors by name; raises SurveyError if too few stamps of the estimate have a truth.
 
-    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; clock_shift_s, ate_at_clock_shift_m: of
-    `best_clock_shift`; unaligned_*: without alignment, or with `from_first` after aligning the first stamp; rpe_*: of the motion
-    between consecutive matched stamps (Sturm et al. 2012); drift_*: of `drift`; nees_*: of the unaligned errors by their covariances, of
-    `consistency`.
+    ate_*: after a rigid alignment; ate_sim3_rmse_m and scale, with its sigma: after one with scale; worst_step_*: of `worst_step`;
+    clock_shift_s, ate_at_clock_shift_m: of `best_clock_shift`; unaligned_*: without alignment, or with `from_first` after aligning the
+    first stamp; rpe_*: of the motion between consecutive matched stamps (Sturm et al. 2012); drift_*: of `drift`; nees_*: of the
+    unaligned errors by their covariances, of `consistency`.
     frames: expected number of estimated frames, the base of evaluated_share.
     """
     rigid = absolute_trajectory_error(estimate, truth, frames=frames)
@@ -187,6 +187,8 @@ def summary(
         "ate_max_m": rigid.max_m,
         "ate_sim3_rmse_m": similarity.rmse_m,
         "scale": similarity.scale,
+        "scale_sigma": scale_sigma(estimate, truth),
+        **{f"worst_step_{name}": value for name, value in worst_step(estimate, truth).items()},
         "clock_shift_s": shift_s,
         "ate_at_clock_shift_m": shifted_m,
         "unaligned_median_m": float(np.median(errors_m)),

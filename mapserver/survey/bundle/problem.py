@@ -139,6 +139,7 @@ _CHUNK = 50_000  # observations; poses and points take 0.3 kB each
 _LEAST_OBSERVATIONS = 100  # of a class: its median is then accurate to 15 %
 # Medians of |x| and of the length of a pair for normal noise of sigma 1
 _MEDIAN_OF_ONE, _MEDIAN_OF_TWO = 0.6745, 1.1774
+_LEAST_SIGMA_PX = 0.01  # finer than any matching
 _EFFICIENT_HUBER = 1.345  # noise sigmas from which the cost is linear: 95 % efficient on normal noise (Huber 1964)
 
 
@@ -149,13 +150,13 @@ def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
     fattening), and errors within one stated sigma bias the scale. The noise differs between cameras, so the survey measures it.
     Observations are grouped into classes by their stated sigma. Each class is scaled by one factor: the ratio of the median
     residual at the problem's values to the stated sigma. The factor also corrects for a cost that
-    is linear from elsewhere than 1.345 noise sigmas. Classes of less than 100 observations are unchanged.
+    is linear from elsewhere than 1.345 noise sigmas. Classes of less than 100 observations are unchanged. Exact ones get a least sigma.
     """
     pixel, disparity = _residuals(problem)
     widened = _EFFICIENT_HUBER / huber_sigmas
     claimed = problem.obs_sigma_px
     columns = [_by_class(pixel / _MEDIAN_OF_TWO, claimed[:, 0]), _by_class(disparity / _MEDIAN_OF_ONE, claimed[:, 1])]
-    return widened * np.stack(columns, axis=1)
+    return widened * np.maximum(np.stack(columns, axis=1), _LEAST_SIGMA_PX)
 
 
 def _residuals(problem: BundleProblem) -> tuple[Array, Array]:

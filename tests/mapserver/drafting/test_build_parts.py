@@ -48,12 +48,13 @@ def test_accuracy_is_over_all_estimated_frames_that_have_a_truth() -> None:
     estimated = np.ones(frames, bool)
     estimated[[3, 7]] = False
     survey = replace(random_survey(rng), trajectory=Trajectory(stamps, estimate), trajectory_estimated=estimated)
-    found = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:-1], true[:-1]))
+    found = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:-1], true[:-1]), stamps[::2])
     assert found.rigid.rmse_m < 1e-9
     assert found.evaluated_share == pytest.approx(0.7)
+    assert found.worst_step["off_m"] < 1e-9
     np.testing.assert_allclose(found.rigid.frame_from_estimate, se3_inverse(NEW_FROM_MAP), atol=1e-9)
-    assert accuracy(survey.estimated_trajectory, frames, None).evaluated_share is None
-    few = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:2], true[:2]))
+    assert accuracy(survey.estimated_trajectory, frames, None, stamps).evaluated_share is None
+    few = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:2], true[:2]), stamps)
     assert (few.rigid, few.evaluated_share) == (None, pytest.approx(0.2))
 
 

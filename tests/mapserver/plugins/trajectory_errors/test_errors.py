@@ -90,6 +90,20 @@ def test_relative_error_agrees_with_evo() -> None:
         assert found[name] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
 
 
+def test_the_scale_has_a_sigma_and_the_worst_step_a_place() -> None:
+    truth, scales, moved = _truth(), [], _truth().frame_from_body
+    for seed in range(20):
+        moved = truth.frame_from_body.copy()
+        moved[:, :3, 3] += np.random.default_rng(seed).normal(0.0, 0.02, (400, 3))
+        found = summary(Trajectory(truth.stamps_ns, moved), truth)
+        scales.append((found["scale"], found["scale_sigma"]))
+    assert 0.5 < np.median(scales, axis=0)[1] / np.std(scales, axis=0)[0] < 2.0
+    moved[150:, 0, 3] += 0.4
+    found = summary(Trajectory(truth.stamps_ns, moved), truth)
+    step = [found[f"worst_step_{name}"] for name in ("from_s", "to_s", "off_m")]
+    np.testing.assert_allclose(step, [149 * 0.05, 150 * 0.05, 0.4], atol=0.1)
+
+
 def test_a_truth_on_another_clock_is_noticed() -> None:
     """The shift is found again, and what the ATE would be without it; a truth on the same clock gives none."""
     truth, estimate = _truth(), _estimate(_truth())

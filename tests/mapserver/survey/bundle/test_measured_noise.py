@@ -56,6 +56,15 @@ def test_each_class_of_claims_has_its_own_noise() -> None:
     assert np.median(found[:, 1]) == pytest.approx(SIGMA_DISPARITY_PX, rel=0.1)
 
 
+def test_exact_observations_have_a_sigma() -> None:
+    given = scene(20, 5, drift=0.0)
+    problem = _at_truth(given, np.tile([0.35, 0.2], (len(given.is_outlier), 1)))
+    own = se3_inverse(problem.map_from_cams)[problem.obs_keyframe, problem.obs_camera]
+    seen = np.einsum("mij,mj->mi", own[:, :3, :3], problem.points_map[problem.obs_landmark]) + own[:, :3, 3]
+    exact = replace(problem, obs_pixels=problem.rig.camera.pixel_from_point(seen))
+    assert measured_sigmas(exact, 0.7).min() > 0.0
+
+
 def test_too_few_observations_keep_their_claims() -> None:
     given = scene(3, 4, drift=0.0)
     problem = _at_truth(given, np.tile([0.35, 0.2], (len(given.is_outlier), 1)))
