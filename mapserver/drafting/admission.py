@@ -27,11 +27,12 @@ from mapserver.survey.survey_inputs import SurveyTools
 # Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth", "repeated images"}
 DECISIVE |= {"gyro scale", "gyro axes", accelerometer_images.NAME, METRES, images.FIXED_PATTERN, images.LENS, *P}
+PAIR = "pair geometry"
 # Properties of a map that depend on the calibration only, and the checks that judge them.
 SUBJECTS = {
     "metric scale": ("baseline", "focal length"),
     "images against IMU": ("gyro axes",),  # a mirrored video, and another run's IMU
-    "pair geometry": ("left and right", "epipolar error", "focal ratio", "pair pitch", "pair yaw", "pair roll"),
+    PAIR: ("left and right", "epipolar error", "focal ratio", "pair pitch", "pair yaw", "pair roll"),
 }
 _CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, odometry estimates it itself
 
@@ -49,6 +50,11 @@ class CheckedRecording:
     calibration: RigEvidence
     corrections: dict[str, float]
     held: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def lacks_pair(self) -> bool:
+        """True if the angle between the two cameras of a pair could not be judged."""
+        return PAIR in self.calibration.not_judged and P.PAIR_YAW not in self.corrections
 
     def statements(self) -> list[str]:
         """Each finding that is not good or not judged, as text, with the correction made."""

@@ -60,7 +60,7 @@ from mapserver.drafting.survey_recordings import (
 )
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import accuracy, truth_from_estimate
-from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
+from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged, pair_yaws
 from mapserver.quality.map_error import map_errors
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
@@ -186,6 +186,12 @@ def build_draft(
             corrections = AreaCorrections()
             if parent is not None:
                 corrections = AreaCorrections.of(maps.areas(request.site), parent.manifest)
+            if lacking := {path: each for path, each in admitted.items() if each.checked.lacks_pair}:
+                known = [
+                    maps.evidence(s.site, s.current_version) for s in maps.sites() if s.current_version is not None
+                ]
+                yaws = pair_yaws(known, settings.noise.turn_sigmas)
+                admitted |= {p: replace(a, pair_yaw=yaws.get(a.checked.calibration.rig)) for p, a in lacking.items()}
             built = _survey(run, admitted, parent, corrections, JobProgress(maps, job.number))
             if parent is not None:
                 parent = built.corrections.applied(parent)

@@ -254,7 +254,7 @@ class Before:
         """Return the version of this manifest and archive, with its tiles from the store."""
         evidence = maps.evidence(manifest.site, manifest.version)
         known = () if evidence is None else evidence.calibrations or ()
-        judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
+        judged = [RigEvidence(rig.rig, rig.judged, pair_yaw=rig.pair_yaw) for rig in known if rig.judged]
         return cls(manifest, survey, [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles], judged)
 
     def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:

@@ -29,7 +29,14 @@ from mapserver.calibration.recordings import LONGEST_S, busiest_frames, busiest_
 from mapserver.doctor.calibration import SURE_SIGMAS
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import DECISIVE, CheckedRecording, checked, leaves_wheels_out, with_further_views
+from mapserver.drafting.admission import (
+    DECISIVE,
+    PAIR,
+    CheckedRecording,
+    checked,
+    leaves_wheels_out,
+    with_further_views,
+)
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.worker import read_ahead
@@ -71,7 +78,7 @@ class RecordingSurvey:
     def remarks(self) -> list[str]:
         """Shortcomings of the recording, corrections and left-out parts, as text."""
         turned = [
-            f"corrected: disparities{of_view} by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by the adjusted survey"
+            f"corrected: disparities{of_view} by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by {yaw.source}"
             for of_view, yaw in self._yaws()
             if yaw.corrected
         ]
@@ -94,9 +101,12 @@ class RecordingSurvey:
         most_px = focal_px * (yaw.warn_above + SURE_SIGMAS * yaw.least_sigma)
         off = [f"{-yaw.shift_px:+.2f} px{of_view}" for of_view, yaw in self._yaws() if abs(yaw.correction_px) > most_px]
         if not off:
-            return self.calibration
+            own, known = self.survey.stereo_yaws[0], None
+            if PAIR in self.calibration.judged and yaw.value not in self.corrections and np.isfinite(own.sigma_px):
+                known = own.shift_px / focal_px, own.sigma_px / focal_px
+            return msgspec.structs.replace(self.calibration, pair_yaw=known)
         words = f"the survey's disparities are {' and '.join(off)} off by its motion; the doctor did not find this"
-        return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
+        return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {PAIR: words})
 
     def _yaws(self) -> list[tuple[str, StereoYaw]]:
         """Return the error of yaw of the pair of each view, with the view's name; that of the first one is empty."""
@@ -128,11 +138,13 @@ class Admission:
     """A recording accepted for a survey, with its findings.
 
     given: its initial trajectory, None for fleetmap's odometry. begun: the first stages of its survey, if the doctor needed them.
+    pair_yaw: see SurveyInputs.
     """
 
     checked: CheckedRecording
     given: GivenPoses | None = None
     begun: AdjustedChain | None = None
+    pair_yaw: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,6 +383,7 @@ def survey_recording(
 ) -> list[RecordingSurvey]:
     """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages.
 
+
     One from which the robot was lifted has several surveys: each part is a drive of its own, which finds its place in the map or does not.
     """
     found, given, chain = admission.checked, admission.given, admission.begun
@@ -381,6 +394,7 @@ def survey_recording(
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
+        inputs = replace(inputs, pair_yaw=admission.pair_yaw)
         if chain is None or chain.state.rig.camera != rectifier.camera:
             chain = begin_survey(inputs, options.settings, tools)
         parts, held = parts_between_lifts(chain.odometry.estimates), [chain]

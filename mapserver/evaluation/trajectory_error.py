@@ -10,7 +10,6 @@ from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
-_TENTHS = 10
 MIN_MATCHED = 3  # stamps with ground truth needed for an alignment
 _OPEN_TURN_RAD = np.deg2rad(1.0)  # error of rotations in a motion capture system
 
@@ -98,18 +97,14 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def scale_sigma(estimate: Trajectory, truth: Trajectory) -> float | None:
-    """Return the sigma of the scale of an alignment, by leaving out each tenth of the path in turn; None for less than ten stamps.
-
-    Errors of neighbouring stamps depend on each other: tenths do less. Source: Künsch 1989 (jackknife of blocks).
-    """
+def scale_sigma(estimate: Trajectory, truth: Trajectory, tenths: int = 10) -> float | None:
+    """Return the sigma of an alignment's scale, by leaving out each tenth in turn (Künsch 1989); None for less than ten stamps."""
     mine, true = paired(estimate, truth)
-    if len(mine) < _TENTHS:
+    if len(mine) < tenths:
         return None
-    tenth = np.arange(len(mine)) * _TENTHS // len(mine)
-    kept = [tenth != left_out for left_out in range(_TENTHS)]
-    scales = [align_points(true.positions_m[k], mine.positions_m[k], with_scale=True)[1] for k in kept]
-    return float(np.sqrt(_TENTHS - 1) * np.std(scales))
+    places, tenth = (true.positions_m, mine.positions_m), np.arange(len(mine)) * tenths // len(mine)
+    scales = [align_points(*(at[tenth != out] for at in places), with_scale=True)[1] for out in range(tenths)]
+    return float(np.sqrt(tenths - 1) * np.std(scales))
 
 
 def worst_step(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:

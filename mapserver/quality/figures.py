@@ -145,12 +145,14 @@ class RigEvidence(msgspec.Struct, frozen=True):
 
     judged: subjects ("pair geometry", ...) found right by a recording, of this draft or of a version that it was built on. not_judged: by
     subject the data missing in this draft's recordings. doubted: by subject the undecided evidence against the calibration.
+    pair_yaw: radians and sigma by which the right camera is turned against it, the surest of surveys that judged the pair.
     """
 
     rig: str
     judged: list[str] = []
     not_judged: dict[str, str] = {}
     doubted: dict[str, str] = {}
+    pair_yaw: tuple[float, float] | None = None
 
     def unknown(self) -> dict[str, str]:
         """The missing data by subject never judged."""
@@ -183,7 +185,9 @@ def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
     for new in rigs:
         old = found.get(new.rig, RigEvidence(new.rig))
         judged = sorted({*old.judged, *new.judged})
-        found[new.rig] = RigEvidence(new.rig, judged, new.not_judged | old.not_judged, new.doubted | old.doubted)
+        yaws = [each.pair_yaw for each in (new, old) if each.pair_yaw is not None]
+        best = min(yaws, key=lambda yaw: yaw[1], default=None)
+        found[new.rig] = RigEvidence(new.rig, judged, new.not_judged | old.not_judged, new.doubted | old.doubted, best)
     return list(found.values())
 
 
@@ -202,6 +206,12 @@ class Evidence(msgspec.Struct, frozen=True):
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None
     calibrations: list[RigEvidence] | None = None
+
+
+def pair_yaws(known: Iterable[Evidence | None], least_sigmas: float) -> dict[str, tuple[float, float]]:
+    """Return by calibration the surest `pair_yaw` of versions, of those that are beyond so many of their sigmas."""
+    yaws = {rig.rig: rig.pair_yaw for rig in merged(r for each in known if each for r in each.calibrations or ())}
+    return {rig: yaw for rig, yaw in yaws.items() if yaw is not None and abs(yaw[0]) > least_sigmas * yaw[1]}
 
 
 def carried_evidence(manifest: Manifest) -> Evidence | None:

@@ -115,7 +115,7 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     state = replace(state, landmarks=Landmarks.empty(), rig=rig)
     chain = replace(chain, odometry=without_doubted(chain.odometry, loops.doubted), state=state)
-    odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools)
+    odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools, inputs.pair_yaw)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
     components = find_components(state, sigma_between(odometry), settings.join_sigma_m)
@@ -262,11 +262,17 @@ def match_again(
 
 
 def refine(
-    first: GlobalMatch, settings: SurveySettings, tools: SurveyTools
+    first: GlobalMatch, settings: SurveySettings, tools: SurveyTools, pair_yaw: tuple[float, float] | None = None
 ) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
-    """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera."""
+    """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera.
+
+    pair_yaw: see SurveyInputs; in place of the first camera's.
+    """
     tools.images.release()
     yaws = _stereo_yaws(first.state, first.redundant, settings)
+    if pair_yaw is not None:
+        shift_px, sigma_px = (first.state.rig.camera.focal_px * angle for angle in pair_yaw)
+        yaws = StereoYaw(shift_px, sigma_px, corrected=True, is_earlier=True), *yaws[1:]
     tools.at("global adjustment", 1, 2)
     odometry, redundant, rounds = _with_depths(first.odometry, first.state, first.depths), first.redundant, 2
     posed = _posed(odometry, first.state)

@@ -51,7 +51,8 @@ class SurveyInputs:
     """One recording: frames in order, raw or rectified in advance, and their number; IMU, wheels, calibration, position priors.
 
     initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry. parts: the same frames in
-    parts, None if they can be read only once. keyframes_at: frames that always become keyframes.
+    parts, None if they can be read only once. keyframes_at: frames that always become keyframes. pair_yaw: radians by which
+    the right camera of the first pair is turned, too large disparities positive, and their sigma, by an earlier survey of the rig.
     """
 
     frames: Iterable[CameraFrame | RectifiedFrame]
@@ -64,6 +65,7 @@ class SurveyInputs:
     parts: FrameParts | None = None
     keyframes_at: frozenset[int] = frozenset()
     priors: Sequence[PositionPrior] = ()
+    pair_yaw: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,11 +26,24 @@ _MIN_DISPARITIES = 200
 
 @dataclass(frozen=True, slots=True)
 class StereoYaw:
-    """Excess of disparities in the middle of the picture, its sigma, and whether the survey corrects it."""
+    """Excess of disparities in the middle of the picture, its sigma, and whether the survey corrects it.
+
+    is_earlier: taken from an earlier survey of the rig.
+    """
 
     shift_px: float
     sigma_px: float
     corrected: bool
+    is_earlier: bool = False
+
+    @property
+    def source(self) -> str:
+        """What measured it, as text."""
+        return (
+            "an earlier survey of this rig: this one cannot judge its pair"
+            if self.is_earlier
+            else "the adjusted survey"
+        )
 
     @property
     def correction_px(self) -> float:

@@ -28,9 +28,9 @@ from mapserver.drafting.survey_recordings import (
     RecordingSurvey,
     survey_recording,
 )
-from mapserver.quality.figures import RigEvidence
+from mapserver.quality.figures import Evidence, RigEvidence, pair_yaws
 from mapserver.survey import stages
-from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
+from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, disparity_shift
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.rig import Rig
@@ -200,6 +200,34 @@ def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
         assert len(surveyed.remarks()) == sum(yaw.corrected for yaw in yaws)
         assert "disparities of view 1 by +2.00 px" in surveyed.remarks()[-1]
         assert words in surveyed.evidence().doubted["pair geometry"]
+
+
+def test_what_cannot_judge_its_pair_takes_the_turn_by_an_earlier_survey(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The earlier one is kept by what judged its pair alone, the surest counts, and one that may be chance changes nothing."""
+    nothing: Any = None
+    marks = replace(Landmarks.empty(), obs_pixels=np.zeros((1, 3)), obs_camera=np.zeros(1, np.int64))
+    state: Any = SimpleNamespace(rig=Rig.of_one(CAMERA, np.eye(4)), priors=(), landmarks=marks)
+    survey: Any = SimpleNamespace(stereo_yaws=(StereoYaw(0.2, 0.05, corrected=True),), state=state)
+    found, lacking = [], RigEvidence("a", not_judged={"pair geometry": "turn"})
+    judging = RigEvidence("a", ["pair geometry"])
+    for evidence, corrections in ((judging, {}), (lacking, {}), (lacking, {"pair yaw": 1e-3})):
+        rest = nothing, evidence, corrections, []
+        found.append(RecordingSurvey(nothing, nothing, nothing, (), nothing, survey, nothing, (), *rest).evidence())
+        lacks = CheckedRecording(nothing, [], evidence, corrections).lacks_pair
+        assert (found[-1].pair_yaw is None, lacks) == (evidence is lacking, evidence is lacking and not corrections)
+    vague, chance = RigEvidence("a", pair_yaw=(0.1, 0.01)), RigEvidence("b", pair_yaw=(1e-5, 1e-4))
+    yaws = pair_yaws([None, Evidence(calibrations=[vague, *found]), Evidence(calibrations=[chance])], 3.0)
+    assert yaws == {"a": pytest.approx((0.2 / CAMERA.focal_px, 0.05 / CAMERA.focal_px))}
+    own = (StereoYaw(-0.05, 0.03, corrected=False),)
+    for name, result in (("_stereo_yaws", own), ("_posed", state), ("refine_observations", marks)):
+        monkeypatch.setattr(stages, name, lambda *_, result=result: result)
+    monkeypatch.setattr(stages, "_adjusted", lambda state, *_: state)
+    monkeypatch.setattr(stages, "replace", lambda _, landmarks: landmarks)
+    first: Any = SimpleNamespace(state=state, redundant=None, odometry=nothing, depths=None, map_from_cam=None)
+    for earlier, shift_px in ((None, 0.0), (yaws["a"], 0.2)):
+        _, adjusted, taken = stages.refine(first, SurveySettings(), SurveyTools(), earlier)
+        np.testing.assert_allclose(adjusted.obs_pixels[:, 2], shift_px * disparity_shift(CAMERA, marks.obs_pixels))  # type: ignore[attr-defined]
+        assert (taken[0].is_earlier, taken[0].corrected) == (bool(shift_px), bool(shift_px))
 
 
 @pytest.mark.parametrize(
