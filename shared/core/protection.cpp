@@ -8,6 +8,7 @@
 #include <map>
 #include <numbers>
 #include <set>
+#include <utility>
 #include <vector>
 
 #include "dense.h"
@@ -23,8 +24,9 @@ constexpr double kForgottenS = 20.0;                          // after a group w
 constexpr double kCellM = 2.0, kZoneM = 8.0, kLowM = 1.0;     // squares of the map; the height above the base that divides it
 constexpr int kColumns = 4, kRows = 3;                        // parts of the image
 constexpr double kNearest = 0.05;                             // metres before the camera
-constexpr int kRounds = 2;                                    // of an update
-constexpr double kFarthest = 1e7;                             // metres, and pixels
+constexpr int kRounds = 2;                                    // of an update, fewer where the first hardly moves what is seen
+constexpr double kSceneM = 2.0, kSettledM = 0.01;
+constexpr double kFarthest = 1e7;  // metres, and pixels
 constexpr double kUnknown = std::numeric_limits<double>::infinity();
 
 // What a mode never used, with the number of a part of the image or of the map. The first two are of one fix: the next makes them anew.
@@ -112,14 +114,18 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
   store(so3_log(mode.map_from_body.rotation * transposed(fix.rotation)), off);
   store(mode.map_from_body.translation - fix.translation, off + 3);
   std::copy_n(off, 6, at);
-  bool is_seen = mode.group.what < Without::kSide;
+  const Without what = mode.group.what;  // its places among a match's groups, which are in its order
+  const int first = std::max(int(what) - int(Without::kSide), 0), last = what < Without::kSide    ? first
+                                                                         : what == Without::kZone ? 10
+                                                                                                  : first + 1;
+  bool is_seen = what < Without::kSide;
   for (int round = 0; round < kRounds; ++round) {
     Mat6 information = before;
     double slope[6] = {};
     for (int a = 0; a < 6; ++a)
       for (int b = 0; b < 6; ++b) slope[a] += before[a][b] * off[b];
     for (const Match& match : matches) {
-      const bool is_left_out = std::find(match.groups, std::end(match.groups), mode.group) != std::end(match.groups);
+      const bool is_left_out = std::find(match.groups + first, match.groups + last, mode.group) != match.groups + last;
       is_seen |= is_left_out;
       if (is_left_out) continue;
       double squared = 0.0;
@@ -130,17 +136,21 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
       }
       if (!(squared < refinement.gate_squared)) continue;
       const double robust = square / (square + squared), weight = robust * robust / kWhite;
-      for (int k = 0; k < (mode.group.what == Without::kDisparities ? 2 : 3); ++k)
+      for (int k = 0; k < (what == Without::kDisparities ? 2 : 3); ++k)
         for (int a = 0; a < 6; ++a) {
-          slope[a] -= weight * match.rows[k][a] * match.rows[k][6];
-          for (int b = 0; b < 6; ++b) information[a][b] += weight * match.rows[k][a] * match.rows[k][b];
+          const double weighed = weight * match.rows[k][a];
+          slope[a] -= weighed * match.rows[k][6];
+          for (int b = 0; b <= a; ++b) information[a][b] += weighed * match.rows[k][b];  // its factor needs the lower triangle alone
         }
     }
     mode.covariance = inverse_spd(information);
+    double change_m = 0.0;
     for (int a = 0; a < 6; ++a) {
-      at[a] = 0.0;
+      const double last = std::exchange(at[a], 0.0);
       for (int b = 0; b < 6; ++b) at[a] += mode.covariance[a][b] * slope[b];
+      change_m += std::abs(at[a] - last) * (a < 3 ? kSceneM : 1.0);
     }
+    if (change_m < kSettledM) break;
   }
   mode.map_from_body = {so3_exp(vec3(at)) * fix.rotation, fix.translation + vec3(at + 3)};
   return is_seen;
