@@ -12,6 +12,8 @@
 #   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
+#   make record                write docs/record.md: acceptance, unseen seeds, hashes of inputs and outputs; an hour (NAMES= for some)
+#   make record-check          repeat a part of it on this machine and compare: equal, or how far apart; minutes
 #   make profile               where the CPU time of a build and of a robot's frame goes, into docs/performance.md (RECORDING=PATH: of its build)
 #   make study NAME=warehouse  an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make clean                 remove everything that the other verbs made
@@ -37,7 +39,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core compiled demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance profile study clean
+.PHONY: help core compiled demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance record record-check profile study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -114,6 +116,12 @@ bench: core
 
 acceptance: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
+
+record: core
+	PYTHONPATH=tests $(BIN)/python -m studies.record $(NAMES)
+
+record-check: core
+	PYTHONPATH=tests $(BIN)/python -m studies.record --check
 
 profile: core
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.profiled $(RECORDING)

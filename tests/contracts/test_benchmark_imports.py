@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parents[1]
-PROGRAMS = sorted(path for folder in ("benchmarks", "studies") for path in (TESTS / folder).rglob("*.py"))
-OURS = ("fleetmap", "mapserver", "locclient", "fleetsim", "benchmarks", "studies", "support")
+PROGRAMS = sorted(path for folder in ("benchmarks", "studies", "golden") for path in (TESTS / folder).rglob("*.py"))
+OURS = ("fleetmap", "mapserver", "locclient", "fleetsim", "benchmarks", "studies", "golden", "support")
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.relative_to(TESTS).as_posix())
@@ -30,8 +30,10 @@ def test_a_program_imports_what_exists(path: Path) -> None:
     assert missing == []
 
 
-def test_every_entry_of_the_acceptance_file_names_a_program() -> None:
-    entries = tomllib.loads((TESTS / "acceptance.toml").read_text("utf-8"))
-    modules = {shlex.split(entry["command"])[0] for entry in entries.values()}
+@pytest.mark.parametrize("file", ["acceptance.toml", "record.toml"])
+def test_every_entry_names_a_program(file: str) -> None:
+    listed = tomllib.loads((TESTS / file).read_text("utf-8")).values()
+    entries = [entry for entry in listed if isinstance(entry, dict)]
+    modules = {shlex.split(entry["command"])[0] for entry in entries}
     assert {name for name in modules if TESTS / f"{name.replace('.', '/')}.py" not in PROGRAMS} == set()
-    assert all("--out {out}" in entry["command"] for entry in entries.values())
+    assert all("--out {out}" in entry["command"] for entry in entries)

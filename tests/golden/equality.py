@@ -1,4 +1,4 @@
-"""Whether maps and estimates are the same before and after a change: hashes of six recordings' tiles, manifests and estimates.
+"""Whether maps and estimates are the same before and after a change: hashes of six recordings' tiles, manifests and estimates, and poses.
 
 `PYTHONPATH=tests python -m golden.equality [--only NAME...] [--work FOLDER] [--out FILE.json]`: a stereo pair, front and rear pairs, a
 pair and a depth camera, RGB-D, one camera with an IMU, and two floors. `diff` names the hashes that differ from those that other code
@@ -12,7 +12,6 @@ import benchmarks  # noqa: F401 -- first of all, before numpy
 import hashlib
 import subprocess
 import tempfile
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from benchmarks.common.recorded_runs import Options, Results, benchmark, recorde
 from fleetmap.encoding import to_json
 from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.recordings import open_recording
+from fleetmap.recordings.tum import format_tum
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.source import ReplaySource
 from locclient import LocalizeOptions, localize
@@ -37,6 +37,7 @@ from locclient.robot.version_trial import TrialSettings
 from mapserver.fleet.building import keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore
+from support.recordings.hashes import hashed, tiles_of
 from support.recordings.realdata import DATA
 
 RIGS = {"stereo": "pair", "front-rear": "front-rear", "front-depth": "front-depth"}
@@ -47,9 +48,10 @@ MEASURED = ("seconds", "realtime_factor", "peak_rss_mb", "pictures")
 
 
 def built(recording: Path, store: Path, site: str, *options: str) -> dict[str, str]:
-    """The hashes of the tiles, and of the manifest without its time and MEASURED, of a recording's map, which is published."""
-    to_store = ["--site", site, "--store", str(store)]
-    subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, "--threads", "2", *options], check=True)
+    """Of a recording's map, which is published: hashes as of `tiles_of`, and of the manifest without its time and MEASURED; all poses."""
+    to_store, out = ["--site", site, "--store", str(store)], store.with_name(f"{site}.tum")
+    kept = ["--threads", "2", "--trajectory-out", str(out)]
+    subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, *kept, *options], check=True)
     subprocess.run(
         [*tool("mapserver"), "publish", *to_store, "--force", "--reason", "compared", "--actor", "golden"], check=True
     )
@@ -57,24 +59,7 @@ def built(recording: Path, store: Path, site: str, *options: str) -> dict[str, s
         manifest = maps.manifest(site, 1)
     report = {name: value for name, value in manifest.report.items() if name not in MEASURED}
     same = to_json(msgspec.structs.replace(manifest, created="", report=report), order="sorted")
-    tiles = {f"tile {n}": entry.sha256 for n, entry in enumerate(manifest.tiles)}
-    return {"manifest": hashlib.sha256(same).hexdigest(), **tiles}
-
-
-def hashed(estimates: Iterable[Estimate]) -> dict[str, str]:
-    """How many frames had each status, and the hash of all of status, floor, pose and covariance, to the bit."""
-    digest, counts = hashlib.sha256(), Counter[str]()
-    for estimate in estimates:
-        counts[f"{estimate.status} {estimate.floor}".strip()] += 1
-        digest.update(
-            f"{estimate.stamp_ns} {estimate.status} {estimate.cause} {estimate.floor} {estimate.refused}".encode()
-        )
-        for numbers in (estimate.map_from_body, estimate.cov_rot_trans, estimate.odometry.odom_from_body):
-            digest.update(b"" if numbers is None else np.ascontiguousarray(numbers).tobytes())
-    return {
-        "frames": ", ".join(f"{status}: {count}" for status, count in sorted(counts.items())),
-        "estimates": digest.hexdigest(),
-    }
+    return {"manifest": hashlib.sha256(same).hexdigest(), **tiles_of(store, site), "survey.tum": out.read_text()}
 
 
 def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
@@ -121,13 +106,16 @@ def figures(name: str, work: Path, store: Path) -> dict[str, str]:
         folder, sensors = REAL[name]
         if not (DATA / folder).is_dir():
             return {"NOT COMPARED": f"{folder} not found in {DATA}"}
-        map_of = built(DATA / folder, store, name, "--use", sensors, "--frames", "::2")
-        return map_of | hashed(
-            localize(DATA / folder, store, name, options=LocalizeOptions(frames="1:200:2")).estimates
-        )
-    rig = ("--rig", RIGS[name])
-    drive = recorded(work, ("--robot", "tote-1", "--day", "1", *rig), "clip")
-    return built(recorded(work, rig, "clip"), store, name) | hashed(localize(drive, store, name).estimates)
+        drive, frames = DATA / folder, "1:200:2"
+        found = built(drive, store, name, "--use", sensors, "--frames", "::2")
+    else:
+        rig, frames = ("--rig", RIGS[name]), ":"
+        drive = recorded(work, ("--robot", "tote-1", "--day", "1", *rig), "clip")
+        found = built(recorded(work, rig, "clip"), store, name)
+    run = localize(drive, store, name, options=LocalizeOptions(frames=frames))
+    with open_recording(drive) as recording:
+        found["recording of the robot"] = recording.content_hash()
+    return found | hashed(run.estimates) | {"robot.tum": format_tum(run.trajectory)}
 
 
 @benchmark([*RIGS, *REAL, FLOORS])

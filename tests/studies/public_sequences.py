@@ -22,6 +22,7 @@ from mapserver.evaluation.trajectory_error import absolute_trajectory_error, pai
 from mapserver.plugins.trajectory_errors.errors import at_first_stamp
 from mapserver.survey.odometry_pass import FrameChain
 from studies.study import PAGES, Column, Row, between_marks, publish, results, rms, table
+from support.recordings.hashes import hashed, tiles_of
 from support.recordings.realdata import DATA
 
 _SHORT_M = 1.0  # of less no share is said
@@ -59,7 +60,8 @@ def survey(path: Path, same_rig: Path | None = None) -> Row:
         assert truth is not None
         found = absolute_trajectory_error(read_tum(out), truth, frames=frames)
         rigid = json.loads(report.read_text())
-    return {
+        tiles = tiles_of(Path(scratch) / "store")
+    return tiles | {
         "frames": frames,
         "seconds": rigid["duration_s"],
         "evaluated_share": found.evaluated_share,
@@ -114,7 +116,8 @@ def case(name: str) -> Row:
         with open_recording(path) as recording:
             truth = recording.ground_truth
         assert truth is not None
-        return row | odometry(played(path, store), truth) | robots(played(path, store, UNSEEN))
+        run = played(path, store, UNSEEN)
+        return row | odometry(played(path, store), truth) | robots(run) | {"robot": hashed(run.estimates)["estimates"]}
 
 
 CASES: dict[str, Callable[[], Row]] = {name: partial(case, name) for name in PEERS}

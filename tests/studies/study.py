@@ -11,17 +11,21 @@ import io
 import json
 import os
 import platform
+import re
+import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import starmap
 from multiprocessing import get_context
 from pathlib import Path
+from shutil import which
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
+from threadpoolctl import threadpool_info
 
 PAGES = Path(__file__).parents[2] / "docs" / "studies"
 _BEGIN, _END = "<!-- begin of results -->", "<!-- end of results -->"
@@ -48,16 +52,29 @@ def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[i
     for row in track(made, name, len(missing), console=Console(stderr=True), disable=len(cases) < 2):
         rows[row["case"]] = row
         path.parent.mkdir(parents=True, exist_ok=True)
-        versions = {package: importlib.metadata.version(package) for package in _VERSIONS}
-        about = {
-            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-            "python": platform.python_version(),
-        } | versions
-        known = {"about": about, "seeds": list(seeds), "rows": [rows[c] for c in cases if c in rows]}
+        known = {"about": about(), "seeds": list(seeds), "rows": [rows[c] for c in cases if c in rows]}
         beside = path.with_suffix(".part")
         beside.write_text(json.dumps(known, indent=1) + "\n")
         beside.replace(path)
     return [rows[case] for case in cases if case in rows]
+
+
+def about() -> Row:
+    """The commit, the machine and the libraries, in words."""
+    root, git = PAGES.parents[1], which("git") or "false"
+    head, changed = (
+        subprocess.run([git, *words], cwd=root, capture_output=True, text=True, check=False).stdout.split()
+        for words in (["rev-parse", "HEAD"], ["diff", "--name-only", "HEAD", "--", ".", ":!docs"])
+    )
+    cpuinfo = Path("/proc/cpuinfo")
+    model = re.search(r"model name\s*: (.*)", cpuinfo.read_text() if cpuinfo.exists() else "")
+    kernels = {f"{of['internal_api']} {of['version']} {of.get('architecture')}" for of in threadpool_info()}
+    return {
+        "commit": " ".join([*(head or ["unknown"]), *(["and changes of", *changed] if changed else [])]),
+        "machine": f"{platform.machine()}, {model[1] if model else 'unknown processor'}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "linear algebra": ", ".join(sorted(kernels)),
+    } | {package: importlib.metadata.version(package) for package in _VERSIONS}
 
 
 def _made(cases: Mapping[str, Callable[[], Row]], jobs: int) -> Iterator[Row]:

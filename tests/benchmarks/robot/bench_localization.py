@@ -1,7 +1,7 @@
 """A robot in the map of another day: every figure that the project promises for it.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_localization [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings of
-`fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
+`PYTHONPATH=tests python -m benchmarks.robot.bench_localization [--only NAME...] [--seed N] [--work FOLDER] [--out FILE.json]`; recordings
+of `fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
 folder) and serve again. CPU times are the process's, as they are and as the machine would take that the limits are for (yardstick.py).
 """
 
@@ -28,6 +28,7 @@ from fleetmap.sources.source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
+from support.recordings.hashes import hashed, tiles_of
 
 # Options of `fleetsim record small-loop` for the robot's recording.
 CASES: dict[str, tuple[str, ...]] = {
@@ -101,18 +102,20 @@ def process_figures(recording: Path, store: Path) -> dict[str, float | None]:
     return {"first_estimate_cpu_s": at_reference(first_s[0], [slowness()]), "rss_mb": max(rss_mb)}
 
 
-@benchmark([*CASES, "process"])
+@benchmark([*CASES, "process"], seed=0)
 def main(arguments: Options) -> Results:
-    store, found = surveyed(arguments.work), {}
+    seed, found = arguments.seed, {}
+    store = surveyed(arguments.work, seed or None)
     if "process" in arguments.only:
         arguments.only.remove("process")
         found["process"] = process_figures(recorded(arguments.work, CASES["next day"]), store)
     for name in arguments.only:
-        recording = recorded(arguments.work, CASES[name])
+        recording = recorded(arguments.work, (("--seed", str(seed)) if seed else ()) + CASES[name])
         played(recording, store, ":60")
         give_back_free_memory()
         slow = [slowness()]
-        found[name] = run_figures(played(recording, store).frames)
+        run = played(recording, store)
+        found[name] = run_figures(run.frames) | {"sha256": hashed(run.estimates)["estimates"]}
         slow.append(slowness())
         alone = odometry_ms(recording)
         found[name] |= {
@@ -122,5 +125,6 @@ def main(arguments: Options) -> Results:
             "cpu_mean_ms_at_reference": at_reference(found[name]["cpu_mean_ms"], slow),
             "cpu_p99_ms_at_reference": at_reference(found[name]["cpu_p99_ms"], slow),
         }
-    survey = json.loads((arguments.work / "survey.json").read_text("utf-8"))
-    return {"cases": found, "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]}
+    survey = json.loads((arguments.work / f"survey{f'-{seed}' if seed else ''}.json").read_text("utf-8"))
+    figures = {"ate_rmse_m": survey["ate_rmse_m"], "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]}
+    return {"cases": found, "map": tiles_of(store)} | figures
