@@ -20,11 +20,13 @@ from locclient.localization.pose_tracker import PoseTracker
 
 
 class Hypothesis(NamedTuple):
-    """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it. floor: whose map, see `Estimate`."""
+    """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it. floor: whose map, see `Estimate`;
+    recall: share of the expected landmarks that they found."""
 
     map_from_body: Array
     support: int
     floor: str = ""
+    recall: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,4 +165,4 @@ def _with_pose(estimate: Estimate, place: Place, **changes: Any) -> Estimate:
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:
-    return tuple(Hypothesis(h.now.map_from_body, h.support, h.now.floor) for h in hypotheses)
+    return tuple(Hypothesis(h.now.map_from_body, h.support, h.now.floor, h.recall) for h in hypotheses)

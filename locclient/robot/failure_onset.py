@@ -20,7 +20,8 @@ PICTURE_WIDTH_PX = 240
 _BEFORE_NS = (2_000_000_000, 500_000_000)
 _EVERY_NS, _KEPT = 250_000_000, 10  # pictures of the last 2.5 s, four a second
 _BREAK_NS = 3_000_000_000  # from lost tracks to a failure caused by them; fixes and status need up to 2 s
-_AGREEING_FIXES = 3  # that make another place significant, as for a kidnapped robot
+AGREEING_FIXES = 3  # that make another place significant, as for a kidnapped robot
+_USUAL_FIXES = 50  # over which their recall is averaged
 _RECENT_FIX_NS = 2_000_000_000
 _DROPPED_STEPS = 1.5  # shortest steps between frames; frames are missing in a longer one
 
@@ -52,7 +53,7 @@ class Belief(NamedTuple):
 class Onset(NamedTuple):
     """The first frame of a failure. left: its left image, of the view compared with the map; pictures: stamps, small images, oldest first.
 
-    belief: carried on to this frame; None if the robot had claimed no pose.
+    belief: carried on to this frame; None if the robot had claimed no pose. track_pixels (N, 3): of the odometry, None if it had none.
     """
 
     stamp_ns: int
@@ -60,6 +61,7 @@ class Onset(NamedTuple):
     pictures: tuple[tuple[int, Image], ...]
     belief: Belief | None
     view: int = 0
+    track_pixels: Array | None = None
 
 
 class Evidence(NamedTuple):
@@ -67,13 +69,14 @@ class Evidence(NamedTuple):
 
     wrong_by_m: distance from the belief to the place of agreeing fixes, None without such fixes. broke: the odometry lost all tracks
     between two good images. had_fix: a fix had agreed with the belief shortly before. places: number of other places with several
-    fixes each.
+    fixes each. usual_recall: share of the expected landmarks found by the last fixes, on average.
     """
 
     wrong_by_m: float | None = None
     broke: bool = False
     had_fix: bool = False
     places: int = 0
+    usual_recall: float = 0.0
 
 
 def refined_cause(cause: Cause, evidence: Evidence) -> Cause:
@@ -95,6 +98,7 @@ class OnsetRecorder:
         self.open: dict[FailureKind, Onset] = {}
         self._belief: Belief | None = None
         self._fix: tuple[int, float] = (-(1 << 62), 0.0)
+        self._usual_recall, self._fixes = 0.0, 0
         self._break: Onset | None = None
         self._least_step_ns = 1 << 62  # between two frames
         self._last: tuple[Estimate, Array] | None = None
@@ -106,6 +110,8 @@ class OnsetRecorder:
         stamp_ns, last, self._last = estimate.stamp_ns, self._last, (estimate, odom_from_body)
         if estimate.fix is not None:
             self._fix = (stamp_ns, estimate.fix.landmark_recall)
+            self._fixes = min(self._fixes + 1, _USUAL_FIXES)
+            self._usual_recall += (estimate.fix.landmark_recall - self._usual_recall) / self._fixes
         # A claimed pose is one without competitors that is not an unconfirmed candidate.
         if estimate.map_from_body is not None and estimate.cov_rot_trans is not None and not estimate.hypotheses:
             claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
@@ -140,10 +146,10 @@ class OnsetRecorder:
             limit_m = max(ERROR_LIMIT_M, radius_95_m(belief.cov_rot_trans))
             elsewhere = tuple(h for h in elsewhere if belief.off_m(h.map_from_body, odom_from_body) > limit_m)
             best = max(elsewhere, key=lambda hypothesis: hypothesis.support, default=None)
-            if wrong_by_m is None and best is not None and best.support >= _AGREEING_FIXES:
+            if wrong_by_m is None and best is not None and best.support >= AGREEING_FIXES:
                 wrong_by_m = belief.off_m(best.map_from_body, odom_from_body)
         places = sum(hypothesis.support >= 2 for hypothesis in elsewhere)
-        return Evidence(wrong_by_m, self._is_break_of(began_ns), had_fix, places)
+        return Evidence(wrong_by_m, self._is_break_of(began_ns), had_fix, places, self._usual_recall)
 
     def _is_break_of(self, began_ns: int) -> bool:
         return self._break is not None and self._break.stamp_ns >= began_ns - _BREAK_NS
@@ -162,7 +168,8 @@ class OnsetRecorder:
         chosen = {picture[0]: picture[1] for picture in before if picture is not None}
         belief = self._belief and self._belief.carried_on(odom_from_body)
         left = _left(frame, view)
-        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, view)
+        tracked = None if self._last is None else self._last[0].odometry.track_pixels
+        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, view, tracked)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
         """Return the picture nearest to a stamp, at most 0.5 s off and before `before_ns`."""

@@ -11,41 +11,59 @@ from fleetmap.failure_definition import known_radius_m
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.tile import Tile
-from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
+from fleetmap.messages import (
+    MAX_THUMBNAIL_BYTES,
+    CameraNote,
+    Cause,
+    FailureEvidence,
+    FailureReport,
+    Placement,
+    Thumbnail,
+)
 from fleetmap.recordings.images import jpeg_image
-from fleetmap.relocalization.map_view import cones_of_tiles, match_visible, visible_landmarks
+from fleetmap.relocalization.map_view import (
+    COLUMNS,
+    ROWS,
+    cones_of_tiles,
+    image_cells,
+    match_visible,
+    visible_landmarks,
+)
 from fleetmap.sensors.rectification import MountedRig, StereoCamera
 from fleetmap.sensors.samples import Image
+from locclient.localization.estimate import Hypothesis
 from locclient.localization.settings import LocalizerSettings
-from locclient.robot.failure_onset import PICTURE_WIDTH_PX
+from locclient.robot.failure_onset import AGREEING_FIXES, PICTURE_WIDTH_PX
 from locclient.robot.robot import FailureContext
 
 Canvas = NDArray[np.uint8]
-Matches = tuple[Array, Array, NDArray[np.int64]]
+Matches = tuple[Array, Array, NDArray[np.int64], Array]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
 _LETTERS = 0.55  # font scale of the title, if it fits
 _MATCHES_WIDTH_PX = 800
 # Width of a blurred picture's content: a face 0.7 m before a lens of 60 degrees or more is 6 pixels wide; from 7 on people recognise it.
 # Source: Sinha et al. 2006, Face recognition by humans: nineteen results all computer vision researchers should know about, result 1.
 _COARSE_PX = 32
+_CELLS, _PLACES = 9, 3  # most of them in a report
 _WINDOW_PX = 25.0  # generous, as the pose may be off: shows possible matches nearby
 
 
 def expected_matches(
     left: Image, camera: StereoCamera, map_from_cam: Array, tiles: Iterable[Tile], settings: LocalizerSettings
 ) -> Matches:
-    """Return pixels (E, 2) of landmarks expected from map_from_cam (4, 4), pixels (N, 2) of the image's features, and (E,) the index of
-    the feature that matches each landmark near its pixel, -1 for none."""
+    """Return pixels (E, 2) of landmarks expected from map_from_cam (4, 4), pixels (N, 2) of the image's features, (E,) the index of
+    the feature that matches each landmark near its pixel, -1 for none, and (E, 3) the landmarks in `map`."""
     tiles = list(tiles)
     max_angle_rad = np.radians(settings.fix.max_view_angle_deg)
-    expected = visible_landmarks(cones_of_tiles(tiles), map_from_cam, camera, 0.0, max_angle_rad)
+    cones = cones_of_tiles(tiles)
+    expected = visible_landmarks(cones, map_from_cam, camera, 0.0, max_angle_rad)
     pixels = expected.pixels
     features = extract(left, settings.orb, camera.clearance_px)
     hit = np.full(len(pixels), -1, np.int64)
     if len(pixels) and len(features):
         descriptors = np.concatenate([tile.descriptors for tile in tiles])[expected.rows]
         hit = match_visible(expected, descriptors, np.full(len(pixels), _WINDOW_PX), features, settings.fix)
-    return pixels, features.pixels, hit
+    return pixels, features.pixels, hit, cones.points_map[expected.rows]
 
 
 def match_view(left: Image, matches: Matches, title: str) -> Canvas:
@@ -53,7 +71,7 @@ def match_view(left: Image, matches: Matches, title: str) -> Canvas:
 
     Green: features and landmarks that match near the projected pixel, joined in the right half; red: unmatched landmarks.
     """
-    pixels, features, hit = matches
+    pixels, features, hit, _ = matches
     seen = cv2.cvtColor(np.ascontiguousarray(left), cv2.COLOR_GRAY2BGR)
     told = np.full_like(seen, 30)
     for pixel in features:
@@ -151,6 +169,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         inliers=inliers[-1] if inliers else None,
         exposure=None if image is None else image.exposure,
         sharpness=None if image is None else image.sharpness,
+        evidence=_evidence(context, profile, matches, map_from_base),
         fixes=failure.fixes,
         calibration=failure.estimate.calibration.text[:2000],
         camera=CameraNote(
@@ -172,6 +191,34 @@ def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
     camera, body_from_cam = profile.rig.mounted[onset.view]
     map_from_cam = onset.belief.map_from_body @ body_from_cam
     return expected_matches(onset.left, camera, map_from_cam, running.tiles.values(), profile.settings)
+
+
+def _evidence(
+    context: FailureContext, profile: RobotProfile, matches: Matches | None, map_from_base: Array | None
+) -> FailureEvidence:
+    """Return what a verdict needs beside the numbers of the report. map_from_base (4, 4): the robot's believed place, None without one."""
+    unmatched, estimate, tracked = context.unmatched, context.failure.estimate, context.unmatched.track_pixels
+    covered = np.zeros(0) if tracked is None else image_cells(tracked, profile.rig.mounted[unmatched.view].camera)
+    cells = np.zeros((0, 4), int)
+    if matches is not None and map_from_base is not None:
+        steps = np.floor(matches[3][:, :2]).astype(int) - np.floor(map_from_base[:2, 3]).astype(int)
+        found, at, expected = np.unique(steps, axis=0, return_inverse=True, return_counts=True)
+        seen = np.bincount(at.ravel(), matches[2] >= 0, len(found)).astype(int)
+        cells = np.column_stack([found, expected, seen])[np.argsort(-expected, kind="stable")[:_CELLS]]
+    others = sorted((h for h in estimate.hypotheses if h.floor == estimate.floor), key=lambda h: -h.support)
+    if estimate.moved_m is not None and estimate.map_from_body is not None:  # found there, and confirmed
+        recall = 0.0 if estimate.fix is None else estimate.fix.landmark_recall
+        others = [Hypothesis(estimate.map_from_body, AGREEING_FIXES, estimate.floor, recall)]
+    places = [(*np.round(100.0 * h.map_from_body[:2, 3]), h.support, round(100.0 * h.recall)) for h in others[:_PLACES]]
+    return FailureEvidence(
+        view_percent=round(100.0 * len(np.unique(covered)) / (COLUMNS * ROWS)),
+        usual_percent=round(100.0 * context.evidence.usual_recall),
+        cells=tuple((x, y, expected, seen) for x, y, expected, seen in cells.tolist()),
+        places=tuple((int(x), int(y), *rest) for x, y, *rest in places) if estimate.is_at_home else (),
+        broke=context.evidence.broke,
+        dropped_percent=round(100.0 * context.dropped_share),
+        flags=context.flags[:2],
+    )
 
 
 def _has_map_changed(context: FailureContext, profile: RobotProfile, hit: NDArray[np.int64]) -> bool:

@@ -33,7 +33,7 @@ class FailureContext(NamedTuple):
     """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
     unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
-    cut: recording of the seconds around its onset, None without one.
+    cut: recording of the seconds around its onset, None without one. flags, dropped_share: as of `Outcome`.
     """
 
     failure: Failure
@@ -42,6 +42,8 @@ class FailureContext(NamedTuple):
     evidence: Evidence
     running: LoadedMap | None
     cut: FailureCut | None = None
+    flags: tuple[Flag, ...] = ()
+    dropped_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +262,8 @@ class Robot:
         failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.open.get(FailureKind.NOT_FOUND, onset)
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
-        return FailureContext(failure, onset, unmatched, evidence, self.running, cut)
+        flags, dropped_share = tuple(self._left_out()), self._load.dropped_share
+        return FailureContext(failure, onset, unmatched, evidence, self.running, cut, flags, dropped_share)
 
     def _show(self, loaded: LoadedMap) -> None:
         if self.ring is not None and not self._site:

@@ -293,6 +293,28 @@ class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
     base_from_cam: Placement
 
 
+_Count = Annotated[int, msgspec.Meta(ge=-(1 << 31), le=1 << 31)]
+
+
+class FailureEvidence(msgspec.Struct, frozen=True, array_like=True):
+    """What the server judges a failure by, beside its report, at most 200 bytes.
+
+    Of the first image without a fix: view_percent of its cells with tracked points; cells: of the map, a metre wide, those with the most
+    expected landmarks: x and y in cells from the robot's believed one, and its expected and seen landmarks. usual_percent of the expected
+    landmarks were seen until then, 0 if unknown. places: where fixes agree: x and y in `map` in centimetres, number of fixes, and percent
+    of the landmarks expected there that they found. broke: all tracks were lost between two good images. dropped_percent of the last
+    seconds' frames. flags: sensors left out, and overload.
+    """
+
+    view_percent: _Count
+    usual_percent: _Count
+    cells: Annotated[tuple[tuple[_Count, _Count, _Count, _Count], ...], msgspec.Meta(max_length=9)] = ()
+    places: Annotated[tuple[tuple[_Count, _Count, _Count, _Count], ...], msgspec.Meta(max_length=3)] = ()
+    broke: bool = False
+    dropped_percent: _Count = 0
+    flags: Annotated[tuple[Name, ...], msgspec.Meta(max_length=2)] = ()
+
+
 class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     """A position failure with its context, as docs/reports.md defines failures.
 
@@ -304,7 +326,8 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     the place of fixes that agree with each other, None without such fixes. landmarks_expected, landmarks_seen: in the first image in which
     the robot was not localised, by its estimate then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
     between neighbouring pixels of a row, 1 is typical for the robot. calibration: the wrong parameter and its error, empty for none.
-    view: of a rig with several, the one that was compared with the map, whose camera and pictures these are; None with one.
+    view: of a rig with several, the one that was compared with the map, whose camera and pictures these are; None with one. evidence:
+    None from older robots.
     """
 
     site: Name
@@ -330,6 +353,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     calibration: Text = ""
     camera: CameraNote | None = None
     view: Annotated[int, msgspec.Meta(ge=0, le=15)] | None = None
+    evidence: FailureEvidence | None = None
     fixes: Annotated[tuple[FixNote, ...], msgspec.Meta(max_length=20)] = ()
     thumbnails: Annotated[tuple[Thumbnail, ...], msgspec.Meta(max_length=4)] = ()
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -92,6 +93,14 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert report.tile in {(-1, 0), (0, 0)}
     assert report.exposure == 0.0
     assert report.inliers is not None
+    evidence = report.evidence
+    assert (evidence.view_percent, evidence.broke, evidence.places) == (0, False, ())
+    assert 5 < evidence.usual_percent <= 100
+    x, y = np.transpose(evidence.cells)[:2] + np.floor(report.map_from_base.target_from_source[:2, 3:])
+    assert np.abs([x, y]).max() < 20, "within the room"
+    expected, seen = np.transpose(evidence.cells)[2:]
+    assert 0 == seen.sum() < expected.sum() <= report.landmarks_expected
+    assert len(encode_message(report)) - len(encode_message(msgspec.structs.replace(report, evidence=None))) <= 200
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
     map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
     np.testing.assert_allclose(map_from_cam, told[0].onset.belief.map_from_body @ rig.body_from_cam, atol=1e-9)
