@@ -91,7 +91,7 @@ class ProtectionMonitor:
         looks = 1.0 if way is not None else min(confirmed.support, 1.0 + confirmed.travelled_m // _LOOK_M)
         if lookalikes is not None:
             is_telling = fix.landmark_recall > lookalikes.recall
-            looks *= min(max(fix.inliers / lookalikes.inliers, 1.0), _MOST_LOOKS) if is_telling else 0.0
+            looks *= min(max(fix.inliers / max(lookalikes.inliers, 1.0), 1.0), _MOST_LOOKS) if is_telling else 0.0
         self._log_odds += looks * evidence
         if way is None and self._prior is not None and self._prior.confirms(confirmed):
             wrong = self._settings.wrong_prior_share if self._prior.is_revisable else self._settings.protection_risk
