@@ -77,7 +77,6 @@ _TRANSFORMS = (
 ARRAYS: Mapping[str, Kind] = {
     **dict.fromkeys(_TRANSFORMS.split(), Kind("<f8", (4, 4), _rigid)),
     **dict.fromkeys(("cov_rot_trans", "cov_bias_cam"), _COVARIANCE),
-    "part_of_map": Kind("<f8", (6, 6), _finite),
     **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), Kind("<f8", (3,), _finite)),
     "PositionPrior.cov_rot_trans": _COVARIANCE._replace(is_good=_prior_covariance),
     "Features.pixels": Kind("<f8", ("n", 2), _within),

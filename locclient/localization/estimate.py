@@ -118,13 +118,13 @@ def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> E
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     known = None if prior is None else prior.hypothesis
     if ranking and (is_open or known is None or not tracker.was_tracking):
-        return estimate if is_open else _with_pose(estimate, ranking[0].now)
+        return estimate if is_open else _with_pose(estimate, tracker, ranking[0].now)
     if known is None or estimate.map_version is None:
         return estimate
     # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
     if radius_95_m(known.now.cov_rot_trans) <= settings.lost_radius_m:
         status = Status.DEGRADED
-    return _with_pose(estimate, known.now, status=status, cause=_cause(estimate, has_failed=True))
+    return _with_pose(estimate, tracker, known.now, status=status, cause=_cause(estimate, has_failed=True))
 
 
 def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
@@ -153,14 +153,13 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
     if status is not Status.TRACKING and told:  # the robot may be at either
         hypotheses = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, cause=cause, hypotheses=hypotheses)
-    return _with_pose(estimate, confirmed.now, status=status, cause=cause)
+    return _with_pose(estimate, tracker, confirmed.now, status=status, cause=cause)
 
 
-def _with_pose(estimate: Estimate, place: Place, **changes: Any) -> Estimate:
-    """Add the pose, beside other changes. The estimate has no pose if pose or covariance contain NaN."""
+def _with_pose(estimate: Estimate, tracker: PoseTracker, place: Place, **changes: Any) -> Estimate:
+    """Add the pose, with the map's own error, beside other changes. The estimate has no pose if pose or covariance contain NaN."""
     if not (np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any()):
-        of_place = place._asdict()
-        changes |= {name: of_place[name] for name in ("map_from_body", "cov_rot_trans", "floor")}
+        changes |= tracker.maps.with_error(place)._asdict()
     return replace(estimate, **changes)
 
 

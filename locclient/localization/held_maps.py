@@ -47,14 +47,15 @@ class HeldMaps:
         held = self.by_floor.get(floor)
         return None if held is None else held.version
 
-    def map_sigmas(self, place: Place) -> Array:
-        """Return the sigmas (6,) of the map's own error at a place, rotation first, in map axes."""
-        held = self.by_floor.get(place.floor)
-        return (UNKNOWN_ERRORS if held is None else held.errors).sigmas(place.position_m)
-
     def map_cov(self, place: Place) -> Array:
-        """Return the covariance (6, 6) of the map's own error at a place."""
-        return np.diag(self.map_sigmas(place) ** 2)
+        """Return the covariance (6, 6) of the map's own error at a place, rotation first, in map axes."""
+        held = self.by_floor.get(place.floor)
+        return np.diag((UNKNOWN_ERRORS if held is None else held.errors).sigmas(place.position_m) ** 2)
+
+    def with_error(self, place: Place, earlier: Place | None = None) -> Place:
+        """Return a place by the map with the map's own error there, or at an earlier place if that one is larger."""
+        of_map = self.map_cov(place) if earlier is None else np.maximum(self.map_cov(place), self.map_cov(earlier))
+        return place._replace(cov_rot_trans=place.cov_rot_trans + of_map)
 
     @property
     def lookalikes(self) -> LookAlikes | None:

@@ -143,7 +143,7 @@ class Localizer:
         if frame is not None:
             finished = self._query.finished
             if finished is not None and finished.fix is not None:
-                place = tracker.place_by(finished.fix)
+                place = self.maps.with_error(tracker.place_by(finished.fix))
                 self.perception.odometry.handle_fix(finished.odometry, *place[:2], is_confirmed=finished.is_confirmed)
             if self._query.finished is not None and self._query.view == 0:
                 self._calibration.add(self._query.finished)

@@ -232,7 +232,7 @@ class MapQuery:
         relocalizer = self._on(hypothesis.now.floor)
         if relocalizer is None:
             return None
-        place = hypothesis.then.of_point(self._tracker.body_from_cam)
+        place = self._tracker.maps.with_error(hypothesis.then).of_point(self._tracker.body_from_cam)
         return relocalizer.near(features, place.map_from_body, place.cov_rot_trans, earlier)
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:

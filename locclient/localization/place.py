@@ -2,10 +2,6 @@
 
 Covariances are rotation first, in map axes, about the body. A perturbation (6,) rotates a pose from the left and shifts its position,
 independently of each other: SO(3) x R^3. Sources: Barfoot and Furgale 2014 for compounding, Hertzberg et al. 2013 for boxplus and boxminus.
-
-The map has an error of its own at each place, which all fixes there share, so that it does not average out. A place keeps how much of its
-own error is the map's, and nobody estimates it: a consider filter. The map's error changes with the way: first-order Gauss-Markov.
-Sources: Schmidt 1966; DuToit et al. 2017 and Geneva et al. 2019 (landmarks of a prior map).
 """
 
 from typing import NamedTuple
@@ -13,24 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import (
-    Array,
-    length,
-    rotation_angle_rad,
-    se3,
-    se3_inverse,
-    skew,
-    so3_exp,
-    so3_log,
-    transport_cov,
-    turn_both,
-)
-
-_MAP_LENGTH_M = (
-    5.0  # way after which a map's error has forgotten all but 1/e of itself: measured, 3 to 8 make no difference
-)
-_SCENE_M = 3.0  # distance of what is seen: a turn shows other parts of the map, as a way does
-_NO_PART = np.zeros((6, 6))
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov, turn_both
 
 
 def boxminus(measured: Array, predicted: Array) -> Array:
@@ -51,16 +30,14 @@ def bounded_turn(covariance: Array) -> Array:
 
 
 class Place(NamedTuple):
-    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6), which includes the map's error.
+    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6).
 
-    floor: the site whose map it is in, of the robot's building; empty for the robot's own. part_of_map (6, 6): covariance of its error
-    with the map's there, in sigmas of that; zero for a place that is not from the map.
+    floor: the site whose map it is in, of the robot's building; empty for the robot's own.
     """
 
     map_from_body: Array
     cov_rot_trans: Array
     floor: str = ""
-    part_of_map: Array = _NO_PART
 
     @property
     def is_finite(self) -> bool:
@@ -77,15 +54,14 @@ class Place(NamedTuple):
     def moved(self, body_from_next: Array, cov_step: Array) -> "Place":
         """Return the place after a step. cov_step: a left perturbation in the body's axes about the body."""
         step = map(np.ascontiguousarray, (*self[:2], body_from_next, cov_step))
-        lever_m = self.map_from_body[:3, :3] @ body_from_next[:3, 3]
-        return Place(*core.compose_pose(*step), self.floor, self._part_after(lever_m, body_from_next))
+        return Place(*core.compose_pose(*step), self.floor)
 
     def at_end_of(self, way: "Place") -> "Place":
         """As `moved`, with the covariance of the way about its end, as for a hypothesis whose map is the body."""
         turn = turn_both(self.map_from_body[:3, :3])
         lever_m = self.map_from_body[:3, :3] @ way.position_m
         covariance = transport_cov(self.cov_rot_trans, lever_m) + turn @ way.cov_rot_trans @ turn.T
-        return Place(self.map_from_body @ way[0], covariance, self.floor, self._part_after(lever_m, way.map_from_body))
+        return Place(self.map_from_body @ way[0], covariance, self.floor)
 
     def before(self, way: "Place") -> "Place":
         """Return the place from which the way led here, the inverse of `at_end_of`."""
@@ -93,48 +69,26 @@ class Place(NamedTuple):
         turn = turn_both(map_from_earlier[:3, :3])
         cov_way = turn @ transport_cov(way.cov_rot_trans, -way.position_m) @ turn.T
         lever_m = map_from_earlier[:3, 3] - self.position_m
-        covariance = transport_cov(self.cov_rot_trans, lever_m) + cov_way
-        return Place(map_from_earlier, covariance, self.floor, self._part_after(lever_m, way.map_from_body))
+        return Place(map_from_earlier, transport_cov(self.cov_rot_trans, lever_m) + cov_way, self.floor)
 
     def of_point(self, body_from_point: Array) -> "Place":
         """Return the place of another frame of the same rigid body."""
         map_from_point = self.map_from_body @ body_from_point
         lever_m = map_from_point[:3, 3] - self.position_m
-        covariance = transport_cov(self.cov_rot_trans, lever_m)
-        return Place(map_from_point, covariance, self.floor, self._part_after(lever_m, np.eye(4)))
-
-    def _part_after(self, lever_m: Array, way: Array) -> Array:
-        """Return `part_of_map` at lever_m (3,) from here, after a way (4, 4)."""
-        part = self.part_of_map
-        if part is _NO_PART:
-            return part
-        way_m = length(way[:3, 3]) + _SCENE_M * rotation_angle_rad(way[:3, :3])
-        carried = np.vstack([part[:3], part[3:] - skew(lever_m) @ part[:3]])
-        return np.asarray(np.exp(-way_m / _MAP_LENGTH_M) * carried)
-
-    def by_map_of(self, sigmas: Array) -> "Place":
-        """Return the place by a map whose own error there has these sigmas (6,)."""
-        return self._replace(cov_rot_trans=self.cov_rot_trans + np.diag(sigmas**2), part_of_map=np.diag(sigmas))
+        return Place(map_from_point, transport_cov(self.cov_rot_trans, lever_m), self.floor)
 
     def innovation_of(self, measured: "Place") -> tuple[Array, float]:
         """Return the innovation (6,) of a measured place, and its squared Mahalanobis distance."""
         error = boxminus(measured.map_from_body, self.map_from_body)
-        return error, float(error @ np.linalg.solve(self._cov_innovation(measured), error))
-
-    def _cov_innovation(self, measured: "Place") -> Array:
-        """The map's error in both of them cancels as far as it is the same."""
-        shared = self.part_of_map @ measured.part_of_map.T
-        return np.asarray(self.cov_rot_trans + measured.cov_rot_trans - shared - shared.T)
+        return error, float(error @ np.linalg.solve(self.cov_rot_trans + measured.cov_rot_trans, error))
 
     def updated(self, measured: "Place") -> "Place":
-        """Return the place updated by a measured one. Sources: Bucy and Joseph 1968, with the map's error as of Schmidt 1966."""
-        shared = self.part_of_map @ measured.part_of_map.T
-        gain = np.linalg.solve(self._cov_innovation(measured), self.cov_rot_trans - shared.T).T  # K = (P - C) S^-1
+        """Return the place updated by a measured one. Source: Bucy and Joseph 1968."""
+        gain = np.linalg.solve(self.cov_rot_trans + measured.cov_rot_trans, self.cov_rot_trans).T  # K = P (P + R)^-1
         rest = np.eye(6) - gain
-        mixed = rest @ shared @ gain.T
-        covariance = rest @ self.cov_rot_trans @ rest.T + gain @ measured.cov_rot_trans @ gain.T + mixed + mixed.T
-        map_from_body = boxplus(self.map_from_body, gain @ boxminus(measured.map_from_body, self.map_from_body))
-        return Place(map_from_body, covariance, self.floor, rest @ self.part_of_map + gain @ measured.part_of_map)
+        covariance = rest @ self.cov_rot_trans @ rest.T + gain @ measured.cov_rot_trans @ gain.T
+        error = boxminus(measured.map_from_body, self.map_from_body)
+        return Place(boxplus(self.map_from_body, gain @ error), covariance, self.floor)
 
 
 ORIGIN = Place(np.eye(4), np.zeros((6, 6)))  # of motions from a frame on

@@ -48,7 +48,7 @@ OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given
 class Start:
     """Start state of a localizer; by default it searches the whole map.
 
-    map_from_body (4, 4), cov_rot_trans, part_of_map (6, 6): the `Place` at frame `frame_index` of the odometry, None without one.
+    map_from_body (4, 4), cov_rot_trans (6, 6): the `Place` at frame `frame_index` of the odometry, None without one.
     is_confirmed: by fixes, with their stamp_ns and support; else by a prior, with its is_revisable, is_told and travelled_m, the distance
     since its arrival. has_broken: tracks were lost since. was_tracking: the robot knew its pose before; is_carried: it was lifted since.
     failed_queries: number of failed map queries in a row. floor: whose map the pose is in, empty for the robot's own site.
@@ -59,7 +59,6 @@ class Start:
     support: int = 0
     map_from_body: Array | None = None
     cov_rot_trans: Array | None = None
-    part_of_map: Array | None = None
     is_confirmed: bool = False
     is_revisable: bool = False
     is_told: bool = True
@@ -186,8 +185,6 @@ class PoseTracker:
         if start.map_from_body is None or start.cov_rot_trans is None:
             return
         place = Place(start.map_from_body, start.cov_rot_trans, start.floor)
-        if start.part_of_map is not None:
-            place = place._replace(part_of_map=start.part_of_map)
         known = PoseHypothesis(start.frame_index, start.stamp_ns, place, place, support=start.support)
         known.has_broken, self.floor = start.has_broken, start.floor
         if start.is_confirmed:
@@ -296,7 +293,7 @@ class PoseTracker:
         for each in self._unmatched:
             own = self._mounted[each.view].camera
             if self._is_aside(each) and replace(own, baseline_m=lens.baseline_m) == lens:
-                earlier_from_query, covariance, *_ = each.frame.then
+                earlier_from_query, covariance, _ = each.frame.then
                 cam_from_query = se3_inverse(each.body_from_cam) @ earlier_from_query @ self.body_from_cam
                 features = each.features if own == lens else each.features.without_depth()
                 found.append(EarlierFrame(features, cam_from_query, covariance))
@@ -308,7 +305,9 @@ class PoseTracker:
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
         assert self._query_frame is not None
-        found = [(fix, PoseHypothesis.at_query(self._query_frame, self.place_by(fix))) for fix in fixes]
+        found = [
+            (fix, PoseHypothesis.at_query(self._query_frame, self.maps.with_error(self.place_by(fix)))) for fix in fixes
+        ]
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
@@ -338,9 +337,8 @@ class PoseTracker:
         return innovation <= self.settings.innovation_limit
 
     def place_by(self, fix: Fix) -> Place:
-        """Return the place of the body by a fix of the last query, and by the map's own error there."""
-        place = Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
-        return place.by_map_of(self.maps.map_sigmas(place))
+        """Return the place of the body by a fix of the last query, without the map's own error."""
+        return Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
         """Return True if fixes, none within the prior, contradict it by now; then drop it: their places must be confirmed."""
@@ -353,14 +351,16 @@ class PoseTracker:
 
     def update(self, fixes: list[Fix], confirmed: PoseHypothesis, *, is_near: bool) -> QueryResult:
         """Update the confirmed pose at the frame of the query (Kalman). Fixes beyond its chi-square gate are refused, and so are
-        several within it: long without a fix, the gate may include an alias of the pose.
+        several within it: long without a fix, the gate may include an alias of the pose. The gate admits another error of the map than
+        at the fixes before; the update does not weigh by it, so that the pose stays beside what the robot sees.
 
         Source: Bar-Shalom et al. 2001 (validation gate).
         """
         assert self._query_frame is not None
         if not fixes:
             return NO_AGREEMENT
-        innovations = [(fix, *confirmed.then.innovation_of(self.place_by(fix))) for fix in fixes]
+        places = [self.maps.with_error(self.place_by(fix), confirmed.start) for fix in fixes]
+        innovations = [(fix, *confirmed.then.innovation_of(place)) for fix, place in zip(fixes, places, strict=True)]
         # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
         limit = self.settings.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]

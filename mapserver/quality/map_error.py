@@ -6,7 +6,6 @@ narrowed; what they disagree beyond is added to them. Errors that all passes sha
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, skew
 from fleetmap.mapformat.map_errors import UNKNOWN_ERROR, ErrorSigmas
+from mapserver.survey.merge.merge import kept
 from mapserver.survey.rig import Looks, projection_by_point
 from mapserver.survey.survey_map import SurveyMap
 
@@ -30,21 +30,24 @@ _Rows = tuple[Array, Array, Array]
 
 
 def map_errors(survey: SurveyMap, tiles: Sequence[tuple[int, int]], size_m: float) -> dict[str, ErrorSigmas]:
-    """Return by tile, as "x,y", the error of the map there. Empty without passes that can be compared, or without metres."""
-    map_from_cam, thinned = (
-        survey.map_from_body @ survey.body_from_cam,
-        1 + len(survey.obs_landmark) // _MOST_OBSERVATIONS,
-    )
-    kept, names = survey.obs_landmark % thinned == 0, ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_sigma_px")
-    survey = replace(survey, **{name: getattr(survey, name)[kept] for name in names})
+    """Return by tile, as "x,y", the error of the map there. Empty without passes that can be compared, or without metres.
+
+    Drives that were joined see no landmarks in common: the tiles that only others than the largest part saw have no error.
+    """
+    if not (survey.scale_known and len(tiles)):
+        return {}
+    thinned = 1 + len(survey.obs_landmark) // _MOST_OBSERVATIONS
+    survey = kept(survey, _largest_part(survey) & (np.arange(len(survey.points_map)) % thinned == 0))
+    map_from_cam = survey.map_from_body @ survey.body_from_cam
     rows = _linearised(survey, map_from_cam)
-    scales = _disagreement(survey, map_from_cam, rows) if survey.scale_known and len(tiles) else None
+    scales = _disagreement(survey, map_from_cam, rows)
     if scales is None:
         return {}
-    off_m = map_from_cam[:, None, :2, 3] - (np.array(tiles) + 0.5) * size_m
-    variances = _marginals(survey, map_from_cam, rows, np.linalg.norm(off_m, axis=2).argmin(axis=0)) / thinned
+    off_m = np.linalg.norm((np.array(tiles)[:, None] + 0.5) * size_m - map_from_cam[:, :2, 3], axis=2)
+    seen = off_m.min(axis=1) < size_m
+    variances = _marginals(survey, map_from_cam, rows, off_m[seen].argmin(axis=1)) / thinned
     found = {}
-    for (x, y), own in zip(tiles, variances, strict=True):
+    for (x, y), own in zip(np.array(tiles)[seen], variances, strict=True):
         values = [share * own[axes].mean() + beyond for axes, (share, beyond) in zip(_GROUPS, scales, strict=True)]
         sigmas = np.clip(np.sqrt(values), 1e-5, UNKNOWN_ERROR)
         found[f"{x},{y}"] = ErrorSigmas(*np.round(sigmas, 6).tolist())
@@ -57,6 +60,15 @@ def error_words(found: Mapping[str, Sequence[float]]) -> str:
         return "own error unknown: no passes to compare"
     turn_rad, *sigmas_m = np.median(list(found.values()), axis=0)
     return f"own error {1e3 * np.max(sigmas_m):.1f} mm, {1e3 * turn_rad:.1f} mrad"
+
+
+def _largest_part(survey: SurveyMap) -> NDArray[np.bool_]:
+    """Return (N,) the landmarks of most keyframes that landmarks connect with each other."""
+    keyframes, landmarks = len(survey.map_from_body), len(survey.points_map)
+    seen = np.ones(len(survey.obs_landmark)), (survey.obs_keyframe, keyframes + survey.obs_landmark)
+    graph = scipy.sparse.coo_array(seen, shape=(keyframes + landmarks, keyframes + landmarks))
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return np.asarray(part[keyframes:] == np.bincount(part[:keyframes]).argmax())
 
 
 def _linearised(survey: SurveyMap, map_from_cam: Array) -> _Rows:

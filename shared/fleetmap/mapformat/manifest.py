@@ -18,7 +18,7 @@ MAX_MANIFEST_BYTES = 64 << 20
 Sha256 = Annotated[str, msgspec.Meta(pattern=SHA256_PATTERN.replace("$", r"\Z"))]
 Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN.replace("$", r"\Z"))]
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62))]
-TileName = Annotated[str, msgspec.Meta(pattern=r"^-?\d{1,10},-?\d{1,10}\Z")]
+TileName = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]{1,10},-?[0-9]{1,10}\Z")]
 Positive = Annotated[int, msgspec.Meta(ge=1, le=(1 << 62))]
 
 

@@ -31,7 +31,7 @@ class MapErrors(NamedTuple):
     def sigmas(self, position_map_m: Array) -> Array:
         """Return (6,), rotation first in radians, then metres, in map axes, at a position (3,)."""
         x, y = np.floor(position_map_m[:2] / self.size_m)
-        turn_rad, horizontal_m, up_m = self.by_tile.get((int(x), int(y)), UNKNOWN_ERROR)
+        turn_rad, horizontal_m, up_m = self.by_tile.get((x, y), UNKNOWN_ERROR)
         return np.array([turn_rad, turn_rad, turn_rad, horizontal_m, horizontal_m, up_m])
 
 

@@ -175,8 +175,7 @@ def judged(
         map_from_cam = se3_inverse(found.cam_from_source)
         turn = turn_both(map_from_cam[:3, :3])
         fix = Place(map_from_cam, 1.2 * turn @ found.cov_rot_trans @ turn.T).of_point(se3_inverse(drive.body_from_cam))
-        measured = fix.by_map_of(map_sigmas)
-        if place.innovation_of(measured)[1] > _GATE:
+        if place.innovation_of(fix._replace(cov_rot_trans=fix.cov_rot_trans + np.diag(map_sigmas**2)))[1] > _GATE:
             continue
         size_px, map_from_body = (drive.camera.width_px, drive.camera.height_px), np.ascontiguousarray(fix[0])
         given: Any = (
@@ -188,7 +187,7 @@ def judged(
             map_from_body,
         )
         bank.update(*given, drive.body_from_cam, size_px, 0.0, 0.4 * frame, *map(np.ascontiguousarray, way[:2]))
-        place, way, is_known = place.updated(measured), ORIGIN, True
+        place, way, is_known = place.updated(fix), ORIGIN, True
         if frame > _STARTED:
             count(truth)
     return np.array(rows).reshape(-1, 4)

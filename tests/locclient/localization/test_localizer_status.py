@@ -8,6 +8,7 @@ import pytest
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.mapformat.map_errors import UNKNOWN_ERROR
 from fleetmap.messages import Cause, FailureKind, Status
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.estimate import assemble
@@ -372,9 +373,8 @@ def test_odometry_that_redefines_its_frame_moves_nothing(tracking: Robot) -> Non
 
 def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> None:
     estimate = tracking.ride(40, 0.05)[-1]
-    turn_rad, *_, least_m = tracking.localizer.maps.map_sigmas(Place(estimate.map_from_body, estimate.cov_rot_trans))
-    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= 0.7 * least_m
-    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= 0.7 * turn_rad
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= UNKNOWN_ERROR.up_m
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= UNKNOWN_ERROR.turn_rad
 
 
 def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer(monkeypatch: pytest.MonkeyPatch) -> None:

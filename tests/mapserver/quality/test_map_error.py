@@ -56,3 +56,12 @@ def test_what_passes_disagree_beyond_their_noise_is_an_error_and_without_passes_
     for less in (observed(survey, survey.obs_keyframe < LAP // 2), replace(survey, scale_known=False)):
         assert map_errors(less, TILES, 16.0) == {}
     assert error_words({}).startswith("own error unknown")
+
+
+def test_drives_that_see_no_landmark_in_common_widen_no_error() -> None:
+    survey = two_laps(0)
+    first = (survey.obs_keyframe < 32) & (survey.obs_landmark % 3 > 0)
+    later = (survey.obs_keyframe >= 32) & (survey.obs_landmark % 3 == 0)
+    found = map_errors(observed(survey, first | later), TILES, 16.0)
+    assert found == map_errors(observed(survey, first), TILES, 16.0) != {}
+    assert found["0,0"].horizontal_m < 0.019
