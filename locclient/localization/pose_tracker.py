@@ -109,6 +109,7 @@ class PoseTracker:
         self.candidates = HypothesisSet(settings.track)
         self._repeated = HypothesisSet(settings.track)  # by all fixes of searches, also those of few matches
         self.confirmed: PoseHypothesis | None = None
+        self.confirmed_by: Prior | None = None  # that it took, beside fixes
         self.was_tracking = False
         self.is_carried = False  # it was lifted since it knew its pose
         self.odom_from_body: Array | None = None  # of the last frame
@@ -156,7 +157,7 @@ class PoseTracker:
 
     def forget(self, *, is_carried: bool = False) -> None:
         """Drop the pose and search the whole map. is_carried: the robot knows that it is lifted, and is LOST if it had a pose."""
-        self.confirmed = self.prior = self._query_frame = None
+        self.confirmed = self.confirmed_by = self.prior = self._query_frame = None
         self.forget_frames()
         self.candidates.reset()
         self._repeated.reset()
@@ -267,7 +268,7 @@ class PoseTracker:
         if confirmed is None or not radius_95_m(confirmed.now.cov_rot_trans) > 0.5 * self.maps.alias_step_m:
             return
         self.candidates.reset()
-        self.candidates.abandoned, self.confirmed, self.prior = confirmed, None, None
+        self.candidates.abandoned, self.confirmed, self.prior, self.followed = confirmed, None, None, None
         if confirmed.now.is_finite:
             self.prior = self.prior_at(PoseHypothesis.at(odometry, confirmed.now), is_revisable=True)
 
@@ -422,7 +423,8 @@ class PoseTracker:
             moved_m = candidates.moved_m(best)
             candidates.reset()
             self._repeated.reset()
-            self.confirmed, self.prior, self.floor = best, None, best.now.floor
+            self.confirmed, self.floor = best, best.now.floor
+            self.confirmed_by, self.prior = self.prior if has_prior else None, None
             self.was_tracking, self.is_carried = True, False
         for fix, hypothesis in self.observations(fixes):
             off_m = np.linalg.norm(hypothesis.now.position_m - best.now.position_m)

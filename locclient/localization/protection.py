@@ -17,7 +17,6 @@ from locclient.localization.calibration.parameters import DRIFT_SIGMAS, HEIGHT, 
 from locclient.localization.estimate import Estimate
 from locclient.localization.place import ORIGIN
 from locclient.localization.pose_tracker import PoseTracker, QueryResult
-from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import TrackSettings
 
 # Share of other places that match as one look does: of a map whose build did not measure it, and the least, since views of one rack are
@@ -38,7 +37,6 @@ class ProtectionMonitor:
     def __init__(self, tracker: PoseTracker, settings: TrackSettings) -> None:
         self._tracker, self._settings = tracker, settings
         self._base_point = np.ascontiguousarray(se3_inverse(tracker.base_from_body)[:3, 3])  # in the body
-        self._prior: Prior | None = None  # the last one before the pose was confirmed
         self.has_wheels = False
         self._reset()
         tracker.on_restart.append(self._reset)
@@ -49,13 +47,11 @@ class ProtectionMonitor:
 
     def handle(self, result: QueryResult) -> None:
         """Use the map query that finished with this frame, if any did."""
-        tracker, fix, way = self._tracker, result.fix, self._tracker.followed
+        tracker, settings, fix, way = self._tracker, self._settings, result.fix, self._tracker.followed
         confirmed, asked, stamp_ns = tracker.confirmed, tracker.asked, result.fix_stamp_ns
-        if confirmed is None:
-            self._prior = tracker.prior
+        if confirmed is None or way is None:  # all earlier evidence was of another pose
             self._reset()
-            return
-        if stamp_ns is None or asked is None:
+        if confirmed is None or stamp_ns is None or asked is None:
             return
         lookalikes = tracker.maps.lookalikes
         share = _WRONG_SHARE if lookalikes is None else min(max(lookalikes.max_wrong_share, _LEAST_SHARE), 1.0)
@@ -72,30 +68,18 @@ class ProtectionMonitor:
         matched, place, camera = fix.matched, tracker.place_by(fix), fix.matched.camera
         measured = matched.points_source, matched.pixels, 1.0 / matched.sigmas_px
         points, pixels, weights = map(np.ascontiguousarray, measured)
-        moved, cov_moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
-        self._bank.update(
-            points,
-            pixels,
-            weights,
-            camera.lens,
-            REFINEMENT,
-            place.map_from_body,
-            tracker.body_from_cam,
-            (camera.width_px, camera.height_px),
-            float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2]),
-            1e-9 * stamp_ns,
-            moved,
-            cov_moved,
-        )
+        moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
+        base_z_m = float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2])
+        placed = place.map_from_body, tracker.body_from_cam, (camera.width_px, camera.height_px), base_z_m
+        self._bank.update(points, pixels, weights, camera.lens, REFINEMENT, *placed, 1e-9 * stamp_ns, *moved)
         tracker.followed = asked
         looks = 1.0 if way is not None else min(confirmed.support, 1.0 + confirmed.travelled_m // _LOOK_M)
         if lookalikes is not None:
             is_telling = fix.landmark_recall > lookalikes.recall
             looks *= min(max(fix.inliers / max(lookalikes.inliers, 1.0), 1.0), _MOST_LOOKS) if is_telling else 0.0
         self._log_odds += looks * evidence
-        if way is None and self._prior is not None and self._prior.confirms(confirmed):
-            wrong = self._settings.wrong_prior_share if self._prior.is_revisable else self._settings.protection_risk
-            self._log_odds -= log(wrong)
+        if way is None and (prior := tracker.confirmed_by) is not None:
+            self._log_odds -= log(settings.wrong_prior_share if prior.is_revisable else settings.protection_risk)
 
     def judged(self, estimate: Estimate) -> Estimate:
         """Return the estimate with its levels: infinite where no level holds."""
@@ -103,7 +87,7 @@ class ProtectionMonitor:
         map_from_body, confirmed, risk = estimate.map_from_body, tracker.confirmed, settings.protection_risk
         if estimate.status not in {Status.TRACKING, Status.DEGRADED} or map_from_body is None:
             return estimate
-        if confirmed is None or way is None:
+        if confirmed is None or way is None or confirmed.has_broken or confirmed.lost_imu:
             return estimate
         is_late = (estimate.stamp_ns - self._fix_ns) * 1e-9 > settings.degraded_after_s
         is_doubted = self._is_refused or any(h.speaks_against_others(settings) for h in tracker.candidates.hypotheses)
@@ -112,15 +96,12 @@ class ProtectionMonitor:
         here, since, cov_since = map(np.ascontiguousarray, (map_from_body, *way.now[:2]))
         cov_map = tracker.maps.map_cov(confirmed.now)
         level_m, level_rad = self._bank.level(here, since, cov_since, cov_map, self._base_point, risk)
-        moved = {
-            d.parameter: abs(d.value) for d in estimate.calibration.drifts if abs(d.value) > _MOVED_SIGMAS * d.sigma
-        }
+        drifts = [drift for drift in estimate.calibration.drifts if abs(drift.value) > _MOVED_SIGMAS * drift.sigma]
+        moved = {drift.parameter: abs(drift.value) for drift in drifts}
         turned_rad = length(np.array([moved.get(parameter, 0.0) for parameter in _MOUNTING]))
         level_m += turned_rad * length(self._base_point) + moved.get(PARAMETERS[HEIGHT], 0.0)
-        off_s = (
-            DRIFT_SIGMAS * TIME_OFFSET.least_sigma if self.has_wheels else 0.0
-        )  # that the odometry may not have found
-        level_m += off_s * length(estimate.odometry.velocity_odom_mps)
-        if level_m > 0.5 * tracker.maps.alias_step_m:  # the next place that looks alike would be within
+        if self.has_wheels:  # whose stamps may be off by what the odometry does not find
+            level_m += DRIFT_SIGMAS * TIME_OFFSET.least_sigma * length(estimate.odometry.velocity_odom_mps)
+        if not level_m <= 0.5 * tracker.maps.alias_step_m:  # the next place that looks alike would be within
             return estimate
         return replace(estimate, protection_m=level_m, protection_deg=float(np.degrees(level_rad + turned_rad)))

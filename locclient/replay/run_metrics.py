@@ -128,16 +128,14 @@ def protection(frames: Frames) -> dict[str, object] | None:
     tracked = [frame for frame in frames if frame.status is Status.TRACKING]
     levels_m = [frame.protection_m for frame in tracked if frame.protection_m < inf]
     shares = [f.error_m / f.protection_m for f in tracked if f.error_m is not None and f.protection_m < inf]
-    return (
-        {
-            "available_share": float(np.mean([frame.protection_m < _USABLE_M for frame in tracked])),
-            "level_m": spread(levels_m, ("median", "p90", "p99", "max")),
-            "beyond_share": float(np.mean([share > 1.0 for share in shares])) if shares else None,
-            "error_of_level": spread(shares, ("median", "max")),
-        }
-        if tracked
-        else None
-    )
+    if not tracked:
+        return None
+    return {
+        "available_share": float(np.mean([frame.protection_m < _USABLE_M for frame in tracked])),
+        "level_m": spread(levels_m, ("median", "p90", "p99", "max")),
+        "beyond_share": float(np.mean([share > 1.0 for share in shares])) if shares else None,
+        "error_of_level": spread(shares, ("median", "max")),
+    }
 
 
 def status_share(frames: Frames) -> dict[str, float]:

@@ -106,7 +106,8 @@ void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
 }
 
 // Updates a mode by the matches outside its group: by the perturbation of the fix's pose that minimises the sum of both costs. Which of
-// them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. True if the group is in view.
+// them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. Where most are not, the mode's
+// odometry went astray, within its covariance as after a way without fixes, and the fix's pose judges. True if the group is in view.
 bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const Refinement& refinement) {
   const Mat6 before = inverse_spd(mode.covariance);
   const double square = refinement.width * refinement.width;
@@ -115,33 +116,40 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
   store(mode.map_from_body.translation - fix.translation, off + 3);
   std::copy_n(off, 6, at);
   const Without what = mode.group.what;  // its places among a match's groups, which are in its order
-  const int first = std::max(int(what) - int(Without::kSide), 0), last = what < Without::kSide    ? first
-                                                                         : what == Without::kZone ? 10
-                                                                                                  : first + 1;
   bool is_seen = what < Without::kSide;
+  const int first = is_seen ? 0 : int(what) - int(Without::kSide), count = is_seen ? 0 : what == Without::kZone ? 4 : 1;
+  const int rows = what == Without::kDisparities ? 2 : 3;
   for (int round = 0; round < kRounds; ++round) {
+    int agreeing = 0;  // less those that do not
     Mat6 information = before;
     double slope[6] = {};
     for (int a = 0; a < 6; ++a)
       for (int b = 0; b < 6; ++b) slope[a] += before[a][b] * off[b];
     for (const Match& match : matches) {
-      const bool is_left_out = std::find(match.groups + first, match.groups + last, mode.group) != match.groups + last;
+      const Group *const from = match.groups + first, *const end = from + count;
+      const bool is_left_out = std::find(from, end, mode.group) != end;
       is_seen |= is_left_out;
       if (is_left_out) continue;
       double squared = 0.0;
-      for (const double* const row : match.rows) {
-        double residual = row[6];
-        for (int a = 0; a < 6; ++a) residual += row[a] * at[a];
+      for (int k = 0; k < rows; ++k) {
+        double residual = match.rows[k][6];
+        for (int a = 0; a < 6; ++a) residual += match.rows[k][a] * at[a];
         squared += residual * residual;
       }
-      if (!(squared < refinement.gate_squared)) continue;
+      const bool is_good = squared < refinement.gate_squared;
+      agreeing += is_good ? 1 : -1;
+      if (!is_good) continue;
       const double robust = square / (square + squared), weight = robust * robust / kWhite;
-      for (int k = 0; k < (what == Without::kDisparities ? 2 : 3); ++k)
+      for (int k = 0; k < rows; ++k)
         for (int a = 0; a < 6; ++a) {
           const double weighed = weight * match.rows[k][a];
           slope[a] -= weighed * match.rows[k][6];
           for (int b = 0; b <= a; ++b) information[a][b] += weighed * match.rows[k][b];  // its factor needs the lower triangle alone
         }
+    }
+    if (round == 0 && agreeing < 0) {
+      std::fill_n(at, 6, 0.0);
+      continue;
     }
     mode.covariance = inverse_spd(information);
     double change_m = 0.0;

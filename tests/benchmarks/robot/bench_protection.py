@@ -7,7 +7,7 @@ at a fix, and just before the next one unless the odometry is at fault.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +15,11 @@ from scipy.stats import beta
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap import core
-from fleetmap.geometry import (
-    Array,
-    rotation_angle_rad,
-    se3,
-    se3_inverse,
-    so3_exp,
-    transform_points,
-    transport_cov,
-    turn_both,
-)  # fmt: skip
+from fleetmap.geometry import Array, se3_inverse, transform_points, transport_cov, turn_both
 from fleetmap.pnp.pnp import GATE_SQUARED, REFINEMENT, Correspondences, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 from fleetsim.recorder import Order
-from locclient.localization.place import ORIGIN, Place
+from locclient.localization.place import ORIGIN, Place, boxminus, boxplus
 from support.estimator.simulated_run import EstimatorSession, unpictured
 from support.estimator.statistics import FeatureStatistics
 
@@ -92,9 +83,7 @@ def drive_of(site: str, seed: int) -> Drive:
     rows: list[tuple[NDArray[np.uint64], Array, Array]] = []
     for frame in kept:
         seen = session.sighting(frame)
-        found = np.argsort(
-            seen.keys[:, 0], kind="stable"
-        )  # a map holds a share of all landmarks, the same in every frame
+        found = np.argsort(seen.keys[:, 0], kind="stable")  # a map holds the same share of all landmarks in each frame
         found = found[seen.octaves[found] < 5.0][:_MATCHES]
         rows.append((seen.ids[found], seen.points_map[found], np.maximum(np.floor(seen.octaves[found]), 0.0)))
     columns = [list(column) for column in zip(*rows, strict=True)]
@@ -116,14 +105,11 @@ def _measured(
     scale, count, pixels = 1.2 ** drive.octaves[frame], len(points), lens.pixel_from_point(in_cam)
     corner = scale * np.where(rng.random(count) < model.slip_share, model.slip_px, model.corner_px) / np.sqrt(2.0)
     off = rng.normal(0.0, 1.0, (count, 3)) * np.column_stack([corner, corner, np.full(count, model.disparity_px)])
-    off[:, 2] += off[:, 0] + (rng.random(count) < model.disparity_wrong_share) * rng.normal(
-        0.0, model.disparity_wrong_px, count
-    )
+    is_wrong = rng.random(count) < model.disparity_wrong_share
+    off[:, 2] += off[:, 0] + is_wrong * rng.normal(0.0, model.disparity_wrong_px, count)
     pixels += off
     pixels[rng.random(count) > model.disparity_known_share, 2] = np.nan
-    own = np.sin(
-        np.outer(drive.ids[frame] % 100_003, (12.9, 78.2, 37.7))
-    )  # errors of landmarks, the same in every frame
+    own = np.sin(np.outer(drive.ids[frame] % 100_003, (12.9, 78.2, 37.7)))  # landmarks' errors, the same in each frame
     mapped = points + _LANDMARK_M * np.sqrt(2.0) * own
     if moved is not None:
         mapped += moved(points, pixels, in_cam, at)[:, None] * size * _SHIFT
@@ -150,17 +136,16 @@ def judged(
     def count(truth: Array) -> None:
         here, moved, cov_moved = map(np.ascontiguousarray, (place.map_from_body, *way[:2]))
         level_m, level_rad = bank.level(here, moved, cov_moved, np.diag(map_sigmas**2), np.zeros(3), risk)
-        error_m = float(np.linalg.norm(here[:3, 3] - truth[:3, 3]))
-        rows.append((error_m, level_m, rotation_angle_rad(here[:3, :3].T @ truth[:3, :3]), level_rad))
+        error_rad, error_m = np.linalg.norm(boxminus(truth, here).reshape(2, 3), axis=1)
+        rows.append((error_m, level_m, error_rad, level_rad))
 
     for frame, truth in enumerate(drive.map_from_body):
         if frame:
             step = se3_inverse(drive.map_from_body[frame - 1]) @ truth
             turn_rad, shift_m, share = _ODOMETRY
             sigmas = np.repeat([turn_rad, shift_m + share * np.linalg.norm(step[:3, 3])], 3)
-            drawn = rng.normal(0.0, sigmas)
-            slip = size * _SHIFT * (fault == "odometry slips" and frame % 7 == 0)
-            step = se3(so3_exp(drawn[:3]) @ step[:3, :3], step[:3, 3] + drawn[3:] + slip)
+            step = boxplus(step, rng.normal(0.0, sigmas))
+            step[:3, 3] += size * _SHIFT * (fault == "odometry slips" and frame % 7 == 0)
             cov_step = transport_cov(np.diag(sigmas**2), -step[:3, 3])
             place, way = place.moved(step, cov_step), way.moved(step, cov_step)
         if is_known and frame > _STARTED and fault != "odometry slips":
@@ -177,16 +162,10 @@ def judged(
         fix = Place(map_from_cam, 1.2 * turn @ found.cov_rot_trans @ turn.T).of_point(se3_inverse(drive.body_from_cam))
         if place.innovation_of(fix._replace(cov_rot_trans=fix.cov_rot_trans + np.diag(map_sigmas**2)))[1] > _GATE:
             continue
-        size_px, map_from_body = (drive.camera.width_px, drive.camera.height_px), np.ascontiguousarray(fix[0])
-        given: Any = (
-            matches.points_source,
-            matches.pixels,
-            1.0 / matches.sigmas_px,
-            drive.camera.lens,
-            REFINEMENT,
-            map_from_body,
-        )
-        bank.update(*given, drive.body_from_cam, size_px, 0.0, 0.4 * frame, *map(np.ascontiguousarray, way[:2]))
+        size_px = drive.camera.width_px, drive.camera.height_px
+        here, moved, cov_moved = map(np.ascontiguousarray, (fix.map_from_body, *way[:2]))
+        seen = matches.points_source, matches.pixels, 1.0 / matches.sigmas_px, drive.camera.lens, REFINEMENT, here
+        bank.update(*seen, drive.body_from_cam, size_px, 0.0, 0.4 * frame, moved, cov_moved)
         place, way, is_known = place.updated(fix), ORIGIN, True
         if frame > _STARTED:
             count(truth)

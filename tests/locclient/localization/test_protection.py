@@ -1,5 +1,6 @@
 """The protection level: its definition, no errors beyond it under faults, and what must fail without one of its parts."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -8,10 +9,13 @@ from scipy.stats import chi
 
 from benchmarks.robot.bench_protection import FAULTS, MAP_SIGMAS, RISK, Drive, judged
 from fleetmap import core
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transform_points
-from fleetmap.pnp.pnp import REFINEMENT
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.pnp.pnp import REFINEMENT, Correspondences
+from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.rectification import StereoCamera
-from locclient.localization.place import Place, boxplus
+from locclient.localization.calibration.watch import CalibrationWatch
+from locclient.localization.place import Place, boxminus, boxplus
+from support.fleet.scripted_robot import NO_FIX, Robot, off
 
 CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.2, 0.06, 0.5]))
@@ -60,9 +64,11 @@ def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
     corner = np.floor(points[:, :2] / 4)
     zones = np.unique([row - shift for row in corner for shift in product((0, 1), repeat=2)], axis=0)
     out += [(1e-3, np.isin(corner - zone, (0, 1)).all(axis=1)) for zone in zones]
-    kept = [(prior, ~mask[:, None] & np.ones(3, bool)) for prior, mask in out if mask.any()]
+    kept: list[tuple[float | None, Array]] = [
+        (prior, ~mask[:, None] & np.ones(3, bool)) for prior, mask in out if mask.any()
+    ]
     kept += [(1e-3, np.tile([True, True, False], (len(points), 1))), (1e-3, np.ones((len(points), 3), bool))]
-    kept += [(1e-3, np.zeros((len(points), 3), bool)), (RISK / 2, np.ones((len(points), 3), bool))]
+    kept += [(1e-3, np.zeros((len(points), 3), bool)), (None, np.ones((len(points), 3), bool))]
 
     way, at = Place(se3(so3_exp(np.array([0, 0, 0.1])), np.array([0.5, 0, 0])), 1e-6 * np.eye(6)), np.array([0, 0.2, 1])
     levels = []
@@ -75,16 +81,11 @@ def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
             information = np.diag([1.0] * 3 + [1 / 900] * 3) + flat.T * weights @ flat
             moved = -np.linalg.solve(information, flat.T @ (weights * off.ravel()))
         here = Place(boxplus(fix, moved), np.linalg.inv(information)).at_end_of(way)
-        there = Place(here.map_from_body, 1.56 * here.cov_rot_trans + np.diag(MAP_SIGMAS**2)).of_point(
-            se3(np.eye(3), at)
-        )
-        factor = chi(3).isf(1 if prior == RISK / 2 else RISK / 2 / (len(kept) - 1) / prior)
-        factor = chi(3).isf(RISK / 2) if prior == RISK / 2 else factor
-        apart = there.map_from_body @ se3_inverse(fix @ way.map_from_body @ se3(np.eye(3), at))
-        shift_m = there.position_m - (fix @ way.map_from_body @ se3(np.eye(3), at))[:3, 3]
+        there = Place(here[0], 1.56 * here.cov_rot_trans + np.diag(MAP_SIGMAS**2)).of_point(se3(np.eye(3), at))
+        factor = chi(3).isf(RISK / 2 / (1 if prior is None else (len(kept) - 1) * prior))
+        apart = boxminus(there.map_from_body, fix @ way.map_from_body @ se3(np.eye(3), at))
         sigmas = [np.sqrt(np.linalg.eigvalsh(there.cov_rot_trans[k : k + 3, k : k + 3])[-1]) for k in (3, 0)]
-        both = np.linalg.norm(shift_m), np.linalg.norm(so3_log(apart[:3, :3]))
-        levels.append([size + factor * sigma for size, sigma in zip(both, sigmas, strict=True)])
+        levels.append([np.linalg.norm(apart[3:]) + factor * sigmas[0], np.linalg.norm(apart[:3]) + factor * sigmas[1]])
     level = bank.level(fix @ way.map_from_body, *way[:2], np.diag(MAP_SIGMAS**2), at.astype(float), RISK)
     assert level == pytest.approx(np.max(levels, axis=0), rel=1e-6)
 
@@ -114,3 +115,51 @@ def test_a_level_without_one_of_its_parts_does_not_hold() -> None:
     level_m = judged(aisle(), np.random.default_rng(0), "none", 0.0)[:, 1]
     error_m = judged(aisle(), np.random.default_rng(0), "near half", 0.1)[:, 0]
     assert error_m.max() > 1.2 * np.median(level_m)  # K sigma alone, without the separation of the modes
+
+
+class Seeing(Robot):
+    """A scripted robot whose fixes have matches."""
+
+    def _fix(self, offset: Array) -> Fix:
+        fix, rng = super()._fix(offset), np.random.default_rng(self.frames)
+        points = CAMERA.point_from_pixel(rng.uniform(20.0, 460.0, (80, 2)), rng.uniform(3.0, 24.0, 80))
+        in_map, pixels = transform_points(fix.map_from_cam, points), CAMERA.pixel_from_point(points)
+        return replace(fix, matched=Correspondences(CAMERA, in_map, pixels, np.ones((80, 2))))
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Seeing:
+    monkeypatch.setattr(CalibrationWatch, "handle", lambda *_: None)
+    return Seeing(monkeypatch, strong_inliers=100).load(alias_step_m=2.0)
+
+
+def levels_m(robot: Seeing, steps: int, offset_m: float = 0.0) -> Array:
+    return np.array([estimate.protection_m for estimate in robot.ride(steps, 0.3, [off(offset_m)])])
+
+
+def test_a_dock_is_the_evidence_of_a_few_looks(robot: Seeing) -> None:
+    robot.told(0.1)
+    assert levels_m(robot, 3)[-1] < 0.5
+    robot.localizer.forget_pose()
+    assert levels_m(robot, 3)[-1] == np.inf and levels_m(robot, 8)[-1] < 0.3
+
+
+def test_odometry_that_went_astray_within_its_covariance_ends_no_level(robot: Seeing) -> None:
+    levels_m(robot, 12)
+    robot.odometry.drift_share = 0.1
+    robot.ride(8, 0.4, NO_FIX)
+    robot.odometry.drift_share = 0.0
+    assert levels_m(robot, 8, 0.2)[-1] < 0.3
+
+
+def test_no_level_holds_after_broken_tracks_nor_for_a_doubted_pose(robot: Seeing) -> None:
+    assert levels_m(robot, 20)[-1] < 0.3
+    robot.odometry.breaks = True
+    assert robot.go(0.3, NO_FIX).protection_m == np.inf
+    assert levels_m(robot, 8)[-1] < 0.3
+    robot.odometry.drift_share, robot.inliers = 0.2, 100
+    while robot.go(0.4, NO_FIX).cov_rot_trans[3, 3] < 0.31**2:
+        pass
+    robot.odometry.drift_share = 0.0
+    known = levels_m(robot, 6)  # a strong fix confirms the pose again, and is one look
+    assert (known[:3] == np.inf).all() and known[-1] < 1.0
