@@ -75,7 +75,7 @@ def courses(events: Iterable[tuple[int, str, str]]) -> list[SurveyCourse]:
         if not kind.startswith(KIND):
             continue
         if words.startswith(ASKED):
-            place, _, tiles = words.removeprefix(ASKED).partition(TILES)
+            place, _, tiles = (words if TILES in words else words + TILES).removeprefix(ASKED).rpartition(TILES)
             found[kind] = SurveyCourse(kind.removeprefix(KIND), place, stamp_ns, tiles.split())
         elif (course := found.get(kind)) is not None and words.startswith(DRIVEN):
             course.driven_ns = course.driven_ns or stamp_ns

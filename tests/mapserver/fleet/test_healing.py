@@ -19,6 +19,7 @@ from mapserver.fleet.resurvey_list import courses_of
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
+from mapserver.floor_plan.survey_requests import ASKED, KIND, TILES, courses
 from mapserver.nightly import robot_drives
 from mapserver.nightly.robot_drives import RobotDrives
 from mapserver.quality.gate import GateSettings
@@ -75,7 +76,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
     made = Scene(tmp_path)
     for number, x in enumerate((21.0, 23.5, 22.0)):
         place = Placement(position_m=(x, 4.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
-        report = blindness(f"f{number}", tile=(1, 0), map_from_base=place)
+        report = blindness(f"f{number}", f"r{number}", tile=(1, 0), map_from_base=place)
         made.store.fleet.add_failure(report, (made.store.now_ns(), made.store.now_ns()), {})
     yield made
     made.store.close()
@@ -140,10 +141,34 @@ def test_a_mended_version_is_tried_first_and_taken_back_as_any(scene: Scene) -> 
     assert [trial.version for trial in store.canaries(running=True)] == [3]
 
 
-def test_a_lone_robot_tries_nothing(scene: Scene) -> None:
-    scene.share = 0.5
+def test_neither_a_robots_word_nor_one_site_ends_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = scene.store
+    save_sample_draft(store, site="damaged")
+    releases.publish(store, "damaged")
+    usual = store.manifest
+    manifest = lambda site, version: usual(site if site == "lab" else "none", version)  # noqa: E731
+    monkeypatch.setattr(store, "manifest", manifest)
+    place = Placement(position_m=(60.0, -1e300, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+    far = blindness("far", tile=(1, 0), map_from_base=place)
+    store.fleet.add_failure(far, (store.now_ns(), store.now_ns()), {})
+    heal(store, ON, store.now_ns())
+    (request,) = store.survey_requests("lab")
+    assert request.corners_map_m == [[18.0, 0.0], [31.99, 0.0], [31.99, 7.0], [18.0, 7.0]], "within the tile"
+
+
+def test_an_area_may_be_called_as_tiles_are(scene: Scene) -> None:
+    """Whatever the name, the tile is known as asked for."""
+    words = f"{ASKED}通路, tiles 3, 40 m2 around 3.0, 4.0 m{TILES}1,0 2,0"
+    (course,) = courses([(5, f"{KIND}ab", words)])
+    assert (course.place, course.tiles) == ("通路, tiles 3, 40 m2 around 3.0, 4.0 m", ["1,0", "2,0"])
+
+
+def test_what_one_robot_of_several_fails_at_is_no_reason(scene: Scene) -> None:
+    for robot in ("r0", "r1"):
+        scene.store.record_robot_report("lab", robot, {})
+    scene.drive(HOUR - 24 * 7, 2, 100.0, tile="0,0")
+    scene.drive(HOUR - 3, 20, 10.0, tile="0,0")
+    alone = blindness("alone", "r1", tile=(0, 0))
+    scene.store.fleet.add_failure(alone, (scene.store.now_ns(), scene.store.now_ns()), {})
     heal(scene.store, ON, scene.store.now_ns())
-    scene.hand_in("ab12ab12")
-    scene.drives.build()
-    current = scene.store.current("lab")
-    assert current is not None and (current.version, scene.store.survey_requests("lab")) == (2, [])
+    assert [request.corners_map_m[0] for request in scene.store.survey_requests("lab")] == [[18.0, 1.0]]

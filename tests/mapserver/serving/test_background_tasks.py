@@ -68,13 +68,8 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
         for number in range(8):
             at_ns = store.canaries()[0].started_ns + NS
             fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=at_ns, cause="changed", version=2))
-        run_for(
-            [
-                replace(task, every_s=0.05)
-                for task in server_tasks(store, fleet, service, CanarySettings(), ResurveySettings())
-            ],
-            2.0,
-        )
+        tasks = server_tasks(store, fleet, service, CanarySettings(), ResurveySettings())
+        run_for([replace(task, every_s=0.05) for task in tasks], 2.0)
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary
         assert "8 failures in" in canary.outcome
