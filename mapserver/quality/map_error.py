@@ -111,14 +111,13 @@ def _disagreement(survey: SurveyMap, map_from_cam: Array, rows: _Rows) -> list[t
     by_camera, by_point, residuals = rows
     steps_m = np.linalg.norm(np.diff(map_from_cam[:, :3, 3], axis=0, prepend=map_from_cam[:1, :3, 3]), axis=1)
     path_m, found = np.cumsum(steps_m), list[tuple[float, Array, Array]]()
-    starts = np.searchsorted(survey.obs_landmark, np.arange(len(survey.points_map) + 1))
     for k in np.unique(np.linspace(0, len(path_m) - 1, _MOST_LOOKS).astype(int)):
         mine = np.flatnonzero(survey.obs_keyframe == k)
-        firsts, lasts = starts[survey.obs_landmark[mine]], starts[survey.obs_landmark[mine] + 1]
-        owners = np.repeat(np.arange(len(mine)), lasts - firsts)
-        others = np.concatenate([np.zeros(0, int), *map(np.arange, firsts, lasts)])
-        is_apart = np.abs(path_m[survey.obs_keyframe[others]] - path_m[k]) > _APART_M
-        owners, others = owners[is_apart], others[is_apart]
+        number = np.full(len(survey.points_map), -1)
+        number[survey.obs_landmark[mine]] = np.arange(len(mine))
+        is_apart = (np.abs(path_m - path_m[k]) > _APART_M)[survey.obs_keyframe]
+        others = np.flatnonzero(is_apart & (number[survey.obs_landmark] >= 0))
+        owners = number[survey.obs_landmark[others]]
         known, pull = np.zeros((len(mine), 3, 3)), np.zeros((len(mine), 3, 1))
         turned = by_point[others].transpose(0, 2, 1)
         np.add.at(known, owners, turned @ by_point[others])
