@@ -40,7 +40,8 @@ def export(
     site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
     hours: Annotated[int | None, typer.Option(min=1, help="Only the last N hours; default: everything.")] = None,
     format_: Annotated[
-        Literal["jsonl", "mcap"] | None, typer.Option("--format", help="jsonl or mcap; default: by the file's name.")
+        Literal["jsonl", "mcap", "verdicts"] | None,
+        typer.Option("--format", help="jsonl, verdicts (jsonl with them) or mcap; default: by the file's name."),
     ] = None,
 ) -> None:
     """Write failures as JSON lines, or as MCAP with log, positions and pictures for Foxglove."""

@@ -51,11 +51,11 @@ class Services:
     health: HealthData
     robots: LiveRobots
     settings: ApiSettings
-    panels: dict[str, list[Callable[..., str]]] = field(default_factory=dict)
+    panels: dict[str, list[Callable[..., Any]]] = field(default_factory=dict)
 
-    def shown(self, place: str, *of: object) -> list[Markup]:
-        """What parts add to a place of a page: the HTML of each, of these services, the page's context and what it is about."""
-        return [Markup(panel(self, *of)) for panel in self.panels.get(place, ())]
+    def shown(self, place: str, *of: object) -> list[Any]:
+        """What parts add to a place of a page: Markup, or layers of a map, of these services, the page's context and what it is about."""
+        return [panel(self, *of) for panel in self.panels.get(place, ())]
 
 
 class PageContext(NamedTuple):

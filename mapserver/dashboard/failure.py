@@ -18,7 +18,7 @@ from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, held, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES, NEAR_NS, places_of
 from mapserver.dashboard.live import words_of
-from mapserver.dashboard.map_layers import Layer, Line, Mark
+from mapserver.dashboard.map_layers import Layer, Line, Mark, Square
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, PictureRow
 
 _NEAR_M = 5.0
@@ -211,6 +211,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "report": report,
         "tone": tone_of(row),
         "answer": answer(detail, moments, clock),
+        "answers": services.shown("answer", context, row, report),
         "advice": ADVICE.get(row.cause),
         "seen": min(seen, key=lambda picture: abs(picture.stamp_ns - began_ns), default=None),
         "clock": clock,
@@ -233,15 +234,18 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
 def _scene(
     services: Services, context: PageContext, row: FailureRow, report: FailureReport, way: Sequence[Line]
 ) -> dict[str, object] | None:
-    """The map around it: what the robot believed in these seconds, and its fixes. None where the version is gone."""
+    """The map around it: what the robot believed in these seconds, its fixes, and what parts add. None where the version is gone."""
     found = [
         Mark(fix.position_map_m[0], fix.position_map_m[1], "accent", "circle", f"fix, {fix.refused or 'used'}")
         for fix in report.fixes
         if fix.position_map_m is not None
     ]
     found += failure_marks(context, [row])
-    layers = [Layer("Path", way), Layer("Failure", found), Layer("Chosen moment")]
-    places_m = [(mark.x, mark.y) for mark in found] + [place for line in way for place in line.points]
+    added = [layer for layers in services.shown("failure_map", context, row, report) for layer in layers]
+    layers = [*added, Layer("Path", way), Layer("Failure", found), Layer("Chosen moment")]
+    marks = [*found, *(item for layer in added for item in layer.items)]
+    places_m = [mark.box[:2] if isinstance(mark, Square) else (mark.x, mark.y) for mark in marks]
+    places_m += [place for line in way for place in line.points]
     version = row.version or services.maps.current_version(context.site)
     return scene_of(services, context, version, layers, places_m=places_m)
 

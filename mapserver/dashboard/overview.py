@@ -311,6 +311,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "kpis": figures,
         "areas": areas,
         "worse": trend_sentence(areas) if areas else "",
+        "panels": services.shown("trends", context),
         "is_chosen": span_ns != EVER,
         "has_areas": bool(services.maps.store.areas(context.site)),
         "outside": OUTSIDE,

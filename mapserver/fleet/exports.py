@@ -1,6 +1,6 @@
 """Failures for other programs, as JSON lines. Plug-ins write other formats."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,15 +21,20 @@ def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[Fa
         yield store.fleet.failure(number)
 
 
-def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
-    """Write one failure a line and return their number; the file is replaced atomically."""
+def write_json_lines(
+    store: MapStore,
+    wanted: FailureFilter,
+    path: Path,
+    more: Callable[[FailureDetail], dict[str, object]] = lambda _: {},
+) -> int:
+    """Write one failure a line, with more of each, and return their number; the file is replaced atomically."""
     count = 0
     with appearing_file(path) as file:
         for found in failures_oldest_first(store, wanted):
             report = to_plain(found.report)
             report.pop("thumbnails")
             pictures = [asdict(picture) for picture in found.pictures]  # by kind and place, without their bytes
-            plain = {**asdict(found.failure), "report": report, "pictures": pictures}
+            plain = {**asdict(found.failure), "report": report, "pictures": pictures, **more(found)}
             file.write(to_json(plain, order="sorted") + b"\n")
             count += 1
     return count

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from fastapi import Response
+from markupsafe import Markup
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
 from fleetmap.mapformat.tile import decode_tile
@@ -49,20 +50,22 @@ def install(host: Host) -> None:
         return file_response(surfel_bytes(found), "application/octet-stream")
 
 
-def _expected(services: Services, context: PageContext, row: FailureRow, report: FailureReport) -> str:
+def _expected(services: Services, context: PageContext, row: FailureRow, report: FailureReport) -> Markup:
     maps = services.maps.store
     lacks = _fault(lambda: index_address(maps.manifest(report.site, failure_camera(report)[0])))
-    return str(_PANELS.expected(context.api, row.number, lacks))
+    return Markup(_PANELS.expected(context.api, row.number, lacks))
 
 
-def _changes(services: Services, context: PageContext, before: int, after: int) -> str:
+def _changes(services: Services, context: PageContext, before: int, after: int) -> Markup:
     lacks = filter(None, (_lacks_surfels(services.maps.store, context.site, number) for number in (before, after)))
-    return str(_PANELS.changes(context.api, context.site, before, after, next(lacks, None)))
+    return Markup(_PANELS.changes(context.api, context.site, before, after, next(lacks, None)))
 
 
-def _link(_: Services, context: PageContext, version: int, *place_m: float) -> str:
+def _link(_: Services, context: PageContext, version: int, *place_m: float) -> Markup:
     place = {axis: round(value, 2) for axis, value in zip("xy", place_m, strict=False)}
-    return str(_PANELS.link(context.to("space", version=version, **place), f"3D view{' from there' if place else ''}"))
+    return Markup(
+        _PANELS.link(context.to("space", version=version, **place), f"3D view{' from there' if place else ''}")
+    )
 
 
 _FARTHEST_M = 20.0  # from the middle of a robot to its camera
