@@ -90,7 +90,7 @@ def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
 
 
 def test_a_resurvey_list_and_its_route(server: Server) -> None:
-    nothing = {"site": "lab", "version": 1, "tiles": [], "route": [], "requests": []}
+    nothing = {"site": "lab", "version": 1, "tiles": [], "route": [], "requests": [], "courses": []}
     assert server.client.get("/v1/sites/lab/resurvey").json() == nothing
     assert server.client.get("/v1/sites/lab/resurvey/route").json()["type"] == "FeatureCollection"
     check_problem(server.client.get("/v1/sites/none/resurvey"), 404, "no site none")
