@@ -9,6 +9,7 @@ from fleetmap.files import appearing_file
 from mapserver.store import FailureDetail, FailureFilter, MapStore
 
 _PAGE = 200
+More = Callable[[FailureDetail], dict[str, object]]
 
 
 def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[FailureDetail]:
@@ -21,12 +22,7 @@ def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[Fa
         yield store.fleet.failure(number)
 
 
-def write_json_lines(
-    store: MapStore,
-    wanted: FailureFilter,
-    path: Path,
-    more: Callable[[FailureDetail], dict[str, object]] = lambda _: {},
-) -> int:
+def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path, more: More = lambda _: {}) -> int:
     """Write one failure a line, with more of each, and return their number; the file is replaced atomically."""
     count = 0
     with appearing_file(path) as file:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import logsumexp
 from scipy.stats import rankdata
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
@@ -43,13 +44,9 @@ def fitted(causes: Sequence[str], found: Array) -> Array:
     counted = np.array([len(names) / len(set(names)) / names.count(name) for name in names])
 
     def loss(flat: Array) -> float:
-        weights = flat.reshape(3, -1)
-        odds = known @ weights.T
-        top = odds.max(axis=1, keepdims=True)
-        missed = np.log(np.exp(odds - top).sum(axis=1)) + top[:, 0] - odds[np.arange(len(truths)), truths]
-        return float(
-            counted @ missed + 0.5 * (weights[:, 1:] ** 2).sum() / _PRIOR_SIGMA**2 + 0.5 * (weights[:, 0] ** 2).sum()
-        )
+        odds, sigmas = known @ flat.reshape(3, -1).T, np.tile([1.0] + found.shape[1] * [_PRIOR_SIGMA], 3)
+        missed = logsumexp(odds, axis=1) - odds[np.arange(len(truths)), truths]
+        return float(counted @ missed + 0.5 * ((flat / sigmas) ** 2).sum())
 
     return np.asarray(minimize(loss, np.zeros(3 * known.shape[1]), method="L-BFGS-B").x.reshape(3, -1))
 

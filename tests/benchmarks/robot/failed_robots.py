@@ -42,6 +42,7 @@ from support.estimator.simulated_run import EstimatorSession, Smudge, unpictured
 LAYOUTS = Layout(aisles=4, bays=8), Layout(aisles=4, bays=8, are_aisles_identical=True)
 LAYOUT = LAYOUTS[0]
 _LEFT_M, _RIGHT_M, _TILE_M, _RATE_HZ = 2.7, LAYOUTS[0].length_m - 2.7, 10.0, 5.0
+Random = np.random.Generator
 SETTINGS = LocalizerSettings()
 _LONGEST_S, _FLOOR_M = 34.0, 0.05  # of a drive; lower landmarks are the ground's
 
@@ -76,7 +77,7 @@ class ChangedField(LandmarkField):
         return replace(found, keys=keys, points_map=points)
 
 
-def way(rng: np.random.Generator, length_m: float, first: int, others: Sequence[int]) -> Route:
+def way(rng: Random, length_m: float, first: int, others: Sequence[int]) -> Route:
     """From the middle of an aisle to its end, into another one of `others`, and so on."""
     at_right = bool(rng.integers(2))
     points = [(float(rng.uniform(_LEFT_M + 8.0, _RIGHT_M - 8.0)), LAYOUT.aisle_y_m(first))]
@@ -150,9 +151,7 @@ class Case:
     turn: Array | None = None
 
 
-def case_of(
-    name: str, rng: np.random.Generator, shared: np.random.Generator, first: int, others: tuple[int, ...]
-) -> Case:
+def case_of(name: str, rng: Random, shared: Random, first: int, others: tuple[int, ...]) -> Case:
     """What is wrong in a cause's drive from aisle `first` to `others`."""
     begins, aids = float(rng.uniform(5.0, 9.0)), {"has_imu": bool(rng.integers(2)), "has_wheels": bool(rng.integers(2))}
     if name == "dark camera":
@@ -209,9 +208,8 @@ def fail(name: str, seed: int, number: int) -> FailureReport | None:
     case = case_of(name, own, np.random.default_rng([seed, number // 8, 9]), first, tuple(others))
     begin, driven = (first, others) if len(case.mapped) == 4 else (first if case.is_told else others[0], others[:2])
     route, day = way(rng, 60.0, begin, driven), int(case.truth != "lookalike")
-    session = _prepared(
-        seed, day, f"way-{number}", Run(case.robot, (*case.before, route), _RATE_HZ, faults=case.faults)
-    )
+    drive = Run(case.robot, (*case.before, route), _RATE_HZ, faults=case.faults)
+    session = _prepared(seed, day, f"way-{number}", drive)
     if not case.has_imu:
         session = replace(session, imu=ImuSamples.empty(), nominal=replace(session.nominal, imu=None))
     if case.dropped < 0:
@@ -229,33 +227,19 @@ def fail(name: str, seed: int, number: int) -> FailureReport | None:
     return _driven(run, case, own, *_view(seed, case.mapped))
 
 
-def _driven(
-    run: EstimatorSession, case: Case, rng: np.random.Generator, view: MapView, tile: Tile
-) -> FailureReport | None:
+def _driven(run: EstimatorSession, case: Case, rng: Random, view: MapView, tile: Tile) -> FailureReport | None:
     nominal, mounted = run.session.nominal, (MountedCamera(run.camera, run.body_from_cam),)
     rig = MountedRig(nominal, mounted, nominal.cameras[0].imu_minus_cam_s)
-    eyes = SimpleNamespace(
-        rig=rig, calibration=nominal, mounted=mounted, body_from_cam=run.body_from_cam, rectify=lambda frame: frame
-    )
-    robot = Robot(eyes, SETTINGS, TrialSettings())
-    odometry = robot.localizer.perception.odometry
-    odometry._new_tracker = lambda first, _: estimator_loop.EstimatorTracker(
-        run, run.camera, SETTINGS.odometry.tracker, first
-    )
+    mounting = {"rig": rig, "calibration": nominal, "mounted": mounted, "body_from_cam": run.body_from_cam}
+    robot = Robot(SimpleNamespace(**mounting, rectify=lambda frame: frame), SETTINGS, TrialSettings())
+    odometry, settings = robot.localizer.perception.odometry, SETTINGS.odometry.tracker
+    odometry._new_tracker = lambda first, _: estimator_loop.EstimatorTracker(run, run.camera, settings, first)
     odometry._tracker = odometry._new_tracker(0, 0)
     cells = [SimpleNamespace(x=x, y=y) for x in range(4) for y in range(3)]
     manifest = SimpleNamespace(tile_size_m=_TILE_M, tiles=cells, version=1, report={}, building=None)
     robot.versions._show = lambda loaded: loaded.show(robot.localizer)
-    robot.use(
-        _Held(
-            SimpleNamespace(version=1, manifest_sha256="", site="hall"),
-            manifest,
-            None,
-            {(0, 0): tile},
-            view=view,
-            session=run,
-        )
-    )
+    version = SimpleNamespace(version=1, manifest_sha256="", site="hall")
+    robot.use(_Held(version, manifest, None, {(0, 0): tile}, view=view, session=run))
     last_ns, dropped, arrives = 0, 0, rng.random(len(run)) >= case.dropped
     for frame, stamp_ns in enumerate(run.stamps_ns[: int(_LONGEST_S * _RATE_HZ)]):
         if frame > 30 and not arrives[frame]:
@@ -275,7 +259,7 @@ def _driven(
     return None
 
 
-def _told(run: EstimatorSession, rng: np.random.Generator, wrong_m: float) -> PositionPrior:
+def _told(run: EstimatorSession, rng: Random, wrong_m: float) -> PositionPrior:
     """A dock's report, which knows the heading to two degrees; wrong_m: that of another aisle's dock."""
     prior = prior_at(run, 0.05, rng)
     prior.map_from_base[1, 3] += wrong_m
