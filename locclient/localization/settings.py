@@ -28,8 +28,8 @@ class TrackSettings(Section, frozen=True):
     # Error rate of operators' poses, which are weighed against aliases of the place. An assumption
     wrong_prior_share: float = 0.05
     near_prior_sigma_m: float = 2.1  # 3.7 sigmas exclude the look-alikes that the map server searches, 8 m away
-    # Squared Mahalanobis distance from the prediction: 0.9999 of chi-square, 6 degrees of freedom
-    innovation_limit: float = 27.856
+    # Squared Mahalanobis distance from the prediction: 0.999 of chi-square, 6 degrees of freedom
+    innovation_limit: float = 22.458
     hypothesis_distance_m: float = 0.5  # within which fixes support one hypothesis
     hypothesis_angle_deg: float = 6.0  # within which fixes support one hypothesis
     competitor_share: float = 0.6  # a competitor with this share of the best one's inliers makes the pose ambiguous
