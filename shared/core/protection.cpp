@@ -106,7 +106,7 @@ void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
 }
 
 // Updates a mode by the matches outside its group: by the perturbation of the fix's pose that minimises the sum of both costs. Which of
-// them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. Where most are not, the mode's
+// them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. Where few are, the mode's
 // odometry went astray, within its covariance as after a way without fixes, and the fix's pose judges. True if the group is in view.
 bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const Refinement& refinement) {
   const Mat6 before = inverse_spd(mode.covariance);
@@ -119,8 +119,8 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
   bool is_seen = what < Without::kSide;
   const int first = is_seen ? 0 : int(what) - int(Without::kSide), count = is_seen ? 0 : what == Without::kZone ? 4 : 1;
   const int rows = what == Without::kDisparities ? 2 : 3;
-  for (int round = 0; round < kRounds; ++round) {
-    int agreeing = 0;  // less those that do not
+  for (int round = 0, rounds = kRounds; round < rounds; ++round) {
+    int agreeing = 0;  // thrice, less those that do not: below 0 where less than a quarter do
     Mat6 information = before;
     double slope[6] = {};
     for (int a = 0; a < 6; ++a)
@@ -137,7 +137,7 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
         squared += residual * residual;
       }
       const bool is_good = squared < refinement.gate_squared;
-      agreeing += is_good ? 1 : -1;
+      agreeing += is_good ? 3 : -1;
       if (!is_good) continue;
       const double robust = square / (square + squared), weight = robust * robust / kWhite;
       for (int k = 0; k < rows; ++k)
@@ -148,7 +148,7 @@ bool update(Mode& mode, const SE3& fix, const std::vector<Match>& matches, const
         }
     }
     if (round == 0 && agreeing < 0) {
-      std::fill_n(at, 6, 0.0);
+      std::fill_n(at, 6, 0.0), ++rounds;
       continue;
     }
     mode.covariance = inverse_spd(information);

@@ -44,13 +44,6 @@ def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) 
     assert max(errors[45:]) < 0.05
 
 
-def test_a_robot_finds_itself_where_nothing_outside_resembles_the_map(store: MapStore) -> None:
-    robot, loaded = robot_world.new_robot(), robot_world.loaded(store)
-    report = {"lookalike_recall": 0.0, "evidence": {"starts": {"max_wrong_share": 0.05, "lookalike_inliers": 0}}}
-    robot.use(replace(loaded, manifest=msgspec.structs.replace(loaded.manifest, report=report)))
-    assert max(drive(robot, range(70), list(robot_world.bundles(70)))[45:]) < 0.05
-
-
 def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> None:
     robot, loaded = robot_world.new_robot(), robot_world.loaded(store)
     frame = {"x_m": 3.0, "y_m": -4.0, "yaw_rad": 0.5}

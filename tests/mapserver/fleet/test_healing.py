@@ -13,6 +13,7 @@ from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import Placement
 from mapserver import releases
 from mapserver.cli import app
+from mapserver.fleet import healing
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.healing import heal
 from mapserver.fleet.resurvey_list import courses_of
@@ -141,34 +142,26 @@ def test_a_mended_version_is_tried_first_and_taken_back_as_any(scene: Scene) -> 
     assert [trial.version for trial in store.canaries(running=True)] == [3]
 
 
-def test_neither_a_robots_word_nor_one_site_ends_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = scene.store
+def test_neither_robots_nor_another_site_end_it_or_ask_for_more(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A damaged site, a place outside its tile, and a tile where one robot of several fails."""
+    store, usual = scene.store, healing.resurvey_list
     save_sample_draft(store, site="damaged")
     releases.publish(store, "damaged")
-    usual = store.manifest
-    manifest = lambda site, version: usual(site if site == "lab" else "none", version)  # noqa: E731
-    monkeypatch.setattr(store, "manifest", manifest)
+    monkeypatch.setattr(healing, "resurvey_list", lambda _, site, *given: usual(store, site[:3], *given))
+    scene.drive(HOUR - 24 * 7, 2, 100.0, tile="0,0")
+    scene.drive(HOUR - 3, 20, 10.0, tile="0,0")
     place = Placement(position_m=(60.0, -1e300, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
-    far = blindness("far", tile=(1, 0), map_from_base=place)
-    store.fleet.add_failure(far, (store.now_ns(), store.now_ns()), {})
+    for name, tile in (("far", (1, 0)), ("alone", (0, 0))):
+        store.record_robot_report("lab", name, {})
+        store.fleet.add_failure(
+            blindness(name, name, tile=tile, map_from_base=place), (store.now_ns(), store.now_ns()), {}
+        )
     heal(store, ON, store.now_ns())
     (request,) = store.survey_requests("lab")
     assert request.corners_map_m == [[18.0, 0.0], [31.99, 0.0], [31.99, 7.0], [18.0, 7.0]], "within the tile"
 
 
-def test_an_area_may_be_called_as_tiles_are(scene: Scene) -> None:
-    """Whatever the name, the tile is known as asked for."""
+def test_an_area_may_be_called_as_tiles_are() -> None:
     words = f"{ASKED}通路, tiles 3, 40 m2 around 3.0, 4.0 m{TILES}1,0 2,0"
     (course,) = courses([(5, f"{KIND}ab", words)])
     assert (course.place, course.tiles) == ("通路, tiles 3, 40 m2 around 3.0, 4.0 m", ["1,0", "2,0"])
-
-
-def test_what_one_robot_of_several_fails_at_is_no_reason(scene: Scene) -> None:
-    for robot in ("r0", "r1"):
-        scene.store.record_robot_report("lab", robot, {})
-    scene.drive(HOUR - 24 * 7, 2, 100.0, tile="0,0")
-    scene.drive(HOUR - 3, 20, 10.0, tile="0,0")
-    alone = blindness("alone", "r1", tile=(0, 0))
-    scene.store.fleet.add_failure(alone, (scene.store.now_ns(), scene.store.now_ns()), {})
-    heal(scene.store, ON, scene.store.now_ns())
-    assert [request.corners_map_m[0] for request in scene.store.survey_requests("lab")] == [[18.0, 1.0]]
