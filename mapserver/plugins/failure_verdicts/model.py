@@ -70,7 +70,9 @@ def figures(report: FailureReport, evidence: FailureEvidence) -> list[float]:
     is_far, is_nowhere = float(wrong_m is not None and not is_near), float(wrong_m is None and not apart and is_seen)
     found = [
         float(cause in _IMAGE),
-        float(cause in _SENSOR or bool(report.calibration) or bool(evidence.flags)),
+        float(
+            cause in _SENSOR or bool(evidence.flags)
+        ),  # a calibration that fixes contradict blames neither: racks move too
         1.0 - evidence.view_percent / 100.0,
         float(evidence.broke),
         float(cause == Cause.CARRIED),

@@ -22,6 +22,6 @@ def install(app: FastAPI, store: MapStore, _: OfferedFile) -> None:
 
     @app.get("/v1/sites/{site}/verdicts")
     def site_verdicts(site: p.Site, span: Asked, by: Literal["tile", "area"] = "tile") -> dict[str, dict[str, int]]:
-        """How often each verdict was given on the last 500 failures of a time, by tile or area."""
+        """How often each verdict was given on the last 200 failures of a time, by tile or area."""
         store.current(site)  # raises for an unknown site
         return {key: dict(said) for key, said in counted(store, site, span, by).items()}

@@ -11,7 +11,7 @@ from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.plugins.failure_verdicts.model import Verdict, verdict
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore
 
-_WEEK_NS, _COUNTED, _AROUND = 168 * HOUR_NS, 500, 2000
+_WEEK_NS, _COUNTED, _AROUND = 168 * HOUR_NS, 200, 2000
 
 
 def judged(store: MapStore, found: Sequence[FailureDetail]) -> list[Verdict]:
@@ -32,7 +32,7 @@ def judged(store: MapStore, found: Sequence[FailureDetail]) -> list[Verdict]:
 
 
 def counted(store: MapStore, site: str, hours: tuple[int, int], by: str) -> dict[str, Counter[str]]:
-    """Return by `tile` or `area` how often each verdict was given, on the last 500 failures of hours since 1970, the end excluded."""
+    """Return by `tile` or `area` how often each verdict was given, on the last 200 failures of hours since 1970, the end excluded."""
     wanted = FailureFilter(site, since_ns=hours[0] * HOUR_NS, until_ns=hours[1] * HOUR_NS)
     found = [store.fleet.failure(row.number) for row in store.fleet.failures(wanted, limit=_COUNTED)]
     counts = defaultdict[str, Counter[str]](Counter)
