@@ -6,8 +6,7 @@ vocabulary are not counted, of `mapserver build` all is.
 
 import os
 import subprocess
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,14 +21,14 @@ from fleetmap.bow.vocabulary import Vocabulary, default_vocabulary
 from fleetmap.geometry import se3_inverse
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.tum import read_tum
+from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from studies.study import Column, Row, publish, results, table
+from studies.study import Column, Row, environment, publish, results, table
 from support.recordings.realdata import DATA
 
 PROGRAM = Path(__file__).with_name("orb_slam3_program.py")
-ENVIRONMENT = Path(sys.prefix) / "orb-slam3"
-_WHEELS = "pyorbslam3==0.1.1", f"opencv-python-headless=={version('opencv-python-headless')}"
+WHEELS = "orb-slam3", "pyorbslam3==0.1.1", f"opencv-python-headless=={version('opencv-python-headless')}"
 _TURNS = int(os.environ.get("TURNS") or 3)
 _WITHOUT_DENSE = "import sys; sys.modules['mapserver.plugins.dense_maps'] = None; "  # as if its folder were deleted
 # Its authors' for EuRoC; the viewer's are asked for and not used.
@@ -49,23 +48,6 @@ class Ran(NamedTuple):
     ate_mm: float
 
 
-def environment() -> Path:
-    """The interpreter beside the wheel, installed where it is not there yet; RuntimeError where it cannot be had."""
-    python = ENVIRONMENT / "bin" / "python"
-    if not (ENVIRONMENT / "complete").exists():
-        for command in (
-            [sys.executable, "-m", "venv", ENVIRONMENT],
-            [python, "-m", "pip", "install", "--quiet", *_WHEELS],
-        ):
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                raise RuntimeError(
-                    f"ORB-SLAM3 IS MISSING, without it this study shows nothing: {done.stderr.strip()[-500:]}"
-                )
-        (ENVIRONMENT / "complete").touch()
-    return python
-
-
 def vocabulary_text(tree: Vocabulary) -> str:
     """Our vocabulary as ORB-SLAM3 reads one: branching, levels, L1 norm, tf-idf; of each node parent, leaf or not, 32 bytes and weight.
 
@@ -81,6 +63,13 @@ def vocabulary_text(tree: Vocabulary) -> str:
     return "\n".join(["10 6 0 0", *lines])
 
 
+def lens_of(camera: CameraCalibration) -> list[float]:
+    """fx, fy, cx, cy, k1, k2, p1, p2; ValueError of another model."""
+    if camera.model != "radial-tangential" or len(camera.distortion) > 4:
+        raise ValueError(f"a {camera.model} lens is not put into the settings of other programs here")
+    return np.append([*camera.intrinsics_px, *camera.distortion], np.zeros(4 - len(camera.distortion))).tolist()
+
+
 def settings_text(recording: Recording) -> str:
     """The settings file of a recording's pair; it rectifies by itself."""
     pair = [recording.calibration.cameras[number] for number in recording.calibration.views[0]]
@@ -90,11 +79,8 @@ def settings_text(recording: Recording) -> str:
     mounting = f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: f\n  data: {left_from_right.ravel().tolist()}"
     lenses = {}
     for number, camera in enumerate(pair, start=1):
-        if camera.model != "radial-tangential" or len(camera.distortion) > 4:
-            raise ValueError(f"{recording.path}: a {camera.model} lens is not put into the settings of ORB-SLAM3 here")
-        values = np.append([*camera.intrinsics_px, *camera.distortion], np.zeros(4 - len(camera.distortion))).tolist()
         keys = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"
-        lenses |= {f"Camera{number}.{key}": value for key, value in zip(keys, values, strict=True)}
+        lenses |= {f"Camera{number}.{key}": value for key, value in zip(keys, lens_of(camera), strict=True)}
     settings = _SETTINGS | size | rate | lenses | {"Stereo.T_c1_c2": mounting}
     return "%YAML:1.0\n" + "".join(f"{key}: {value}\n" for key, value in settings.items())
 
@@ -107,11 +93,16 @@ def export(recording: Recording, folder: Path) -> None:
     (folder / "stamps.txt").write_text(
         "\n".join(f"{1e-9 * (stamp - begin_ns):.9f}" for stamp in recording.frame_stamps_ns)
     )
-    for number in range(len(recording)):
+    export_images(recording, range(len(recording)), folder)
+
+
+def export_images(recording: Recording, frames: Iterable[int], folder: Path) -> None:
+    """Writes the images of these frames as they are stored."""
+    for number in frames:
         stored = recording.stored_frame(number)
         for side, image in (("left", stored.left), ("right", stored.right)):
             assert image is not None and image.encoding == "file"
-            (folder / side).mkdir(exist_ok=True)
+            (folder / side).mkdir(parents=True, exist_ok=True)
             (folder / side / f"{number:06d}.png").write_bytes(image.data)
 
 
@@ -127,28 +118,28 @@ def measured(command: Sequence[str | Path]) -> tuple[float, float]:
     return used.ru_utime + used.ru_stime, 1.024e-3 * used.ru_maxrss
 
 
-def ate_mm(world_from_left: Trajectory, recording: Recording) -> float:
-    """Root mean square of the left camera's position errors over all pairs, rigidly aligned; infinite where a pair has no pose.
+def ate_mm(world_from_left: Trajectory, recording: Recording, pairs: int) -> float:
+    """Root mean square of the left camera's position errors over so many pairs, rigidly aligned; infinite where one has no pose.
 
     Of rectification's turn of the camera nothing is seen.
     """
     truth = recording.ground_truth
     assert truth is not None
-    true = Trajectory(truth.stamps_ns, truth.frame_from_body @ _body_from_left(recording))
-    found = absolute_trajectory_error(world_from_left, true, frames=len(recording))
-    return 1e3 * found.rmse_m if len(world_from_left) > 0.99 * len(recording) else float("inf")
+    true = Trajectory(truth.stamps_ns, truth.frame_from_body @ body_from_left(recording))
+    found = absolute_trajectory_error(world_from_left, true, frames=pairs)
+    return 1e3 * found.rmse_m if len(world_from_left) > 0.99 * pairs else float("inf")
 
 
-def _body_from_left(recording: Recording) -> np.ndarray:
+def body_from_left(recording: Recording) -> np.ndarray:
     return recording.calibration.cameras[recording.calibration.views[0][0]].body_from_cam
 
 
 def orb_slam3(recording: Recording, files: Path) -> Ran:
     """A run of ORB-SLAM3."""
-    cpu_s, rss_mb = measured([environment(), PROGRAM, files])
+    cpu_s, rss_mb = measured([environment(*WHEELS) / "bin" / "python", PROGRAM, files])
     found = read_tum(files / "poses.tum")
     moved = Trajectory(found.stamps_ns + recording.frame_stamps_ns[0], found.frame_from_body)
-    return Ran(cpu_s - float((files / "begun.txt").read_text()), rss_mb, ate_mm(moved, recording))
+    return Ran(cpu_s - float((files / "begun.txt").read_text()), rss_mb, ate_mm(moved, recording, len(recording)))
 
 
 def mapserver(recording: Recording, *, with_dense: bool) -> Ran:
@@ -160,8 +151,8 @@ def mapserver(recording: Recording, *, with_dense: bool) -> Ran:
         main = main if with_dense else _WITHOUT_DENSE + main
         cpu_s, rss_mb = measured([program, flag, main, "build", str(recording.path), *to_store])
         found = read_tum(out)
-    left = Trajectory(found.stamps_ns, found.frame_from_body @ _body_from_left(recording))
-    return Ran(cpu_s, rss_mb, ate_mm(left, recording))
+    left = Trajectory(found.stamps_ns, found.frame_from_body @ body_from_left(recording))
+    return Ran(cpu_s, rss_mb, ate_mm(left, recording, len(recording)))
 
 
 def case(name: str, path: Callable[[], Path], most: float, most_dense: float) -> Row:
@@ -200,7 +191,7 @@ COLUMNS = [
 
 def main() -> None:
     """The table of docs/studies/orb_slam3.md. TURNS=5: so many rounds of a recording."""
-    environment()
+    environment(*WHEELS)
     publish("orb_slam3", [table(results("orb_slam3", CASES), COLUMNS)], None)
 
 

@@ -13,6 +13,7 @@ import os
 import platform
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import starmap
@@ -96,6 +97,17 @@ def _timed(case: str, make: Callable[[], Row]) -> Row:
 def _cpu_s() -> float:
     """Of this process and of those that it waited for."""
     return sum(os.times()[:4])
+
+
+def environment(name: str, *wheels: str) -> Path:
+    """The folder of an environment of these wheels alone, made where it is not there yet; RuntimeError where they cannot be had."""
+    folder = Path(sys.prefix) / name
+    install = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", *wheels]
+    for command in () if (folder / "complete").exists() else ([sys.executable, "-m", "venv", folder], install):
+        if subprocess.run(command, check=False).returncode:
+            raise RuntimeError(f"{' '.join(wheels)} IS MISSING, without it this study shows nothing")
+    (folder / "complete").touch()
+    return folder
 
 
 def table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
