@@ -60,7 +60,7 @@ def survey(path: Path, same_rig: Path | None = None) -> Row:
         assert truth is not None
         found = absolute_trajectory_error(read_tum(out), truth, frames=frames)
         rigid = json.loads(report.read_text())
-        tiles = tiles_of(Path(scratch) / "store")
+        tiles = tiles_of(store, "surveyed")
     return tiles | {
         "frames": frames,
         "seconds": rigid["duration_s"],
