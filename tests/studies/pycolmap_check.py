@@ -56,9 +56,9 @@ def adjusted(recording: Recording, folder: Path, map_from_left: dict[int, Array]
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         model.load(pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions()))
-    for number, pose in map_from_left.items():
+    for number, map_from_cam in map_from_left.items():
         frame = model.find_image_with_name(NAME.format(number)).frame
-        frame.rig_from_world = pycolmap.Rigid3d(se3_inverse(pose)[:3])
+        frame.rig_from_world = pycolmap.Rigid3d(se3_inverse(map_from_cam)[:3])
         model.register_frame(frame.frame_id)
     model = pycolmap.triangulate_points(model, database, images, folder)
     before_px = model.compute_mean_reprojection_error()
@@ -94,9 +94,9 @@ def case(name: str) -> Row:
         ours = ours @ body_from_left(recording)
         frames = np.searchsorted(recording.frame_stamps_ns, stamps_ns).tolist()
         model, before_px = adjusted(recording, Path(folder), dict(zip(frames, ours, strict=True)))
-        poses = np.tile(np.eye(4), (len(frames), 1, 1))
-        poses[:, :3, 3] = [model.find_image_with_name(NAME.format(n)).projection_center() for n in frames]
-        mine, theirs = Trajectory(stamps_ns, ours), Trajectory(stamps_ns, poses)
+        map_from_cam = np.tile(np.eye(4), (len(frames), 1, 1))
+        map_from_cam[:, :3, 3] = [model.find_image_with_name(NAME.format(n)).projection_center() for n in frames]
+        mine, theirs = Trajectory(stamps_ns, ours), Trajectory(stamps_ns, map_from_cam)
         apart, scaled = (absolute_trajectory_error(mine, theirs, with_scale=is_scaled) for is_scaled in (False, True))
         moved = transform_points(apart.frame_from_estimate, built.points_map)
         seen = (moved[built.obs_landmark[built.obs_keyframe == number]] for number in keyframes)
