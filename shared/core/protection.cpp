@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/in_turn.h"
 #include "dense.h"
 
 namespace fleetmap {
@@ -261,11 +262,12 @@ class ProtectionBank {
 }  // namespace
 
 void bind_protection(nb::module_& module) {
-  nb::class_<ProtectionBank>(module, "ProtectionBank")
+  nb::class_<Shared<ProtectionBank>>(module, "ProtectionBank")
       .def(nb::init<>())
-      .def("update", &ProtectionBank::update, "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a, "map_from_body"_a,
-           "body_from_cam"_a, "size_px"_a, "base_z_m"_a, "stamp_s"_a, "way"_a, "cov_way"_a)
-      .def("level", &ProtectionBank::level, "map_from_body"_a, "way"_a, "cov_way"_a, "cov_map"_a, "point"_a, "risk"_a);
+      .def("update", in_turn<PythonLock::kReleased>(&ProtectionBank::update), "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a,
+           "map_from_body"_a, "body_from_cam"_a, "size_px"_a, "base_z_m"_a, "stamp_s"_a, "way"_a, "cov_way"_a)
+      .def("level", in_turn<PythonLock::kReleased>(&ProtectionBank::level), "map_from_body"_a, "way"_a, "cov_way"_a, "cov_map"_a, "point"_a,
+           "risk"_a);
 }
 
 }  // namespace fleetmap
