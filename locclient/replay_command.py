@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
+from fleetmap.cli_options import TopicNames, settings_of
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
@@ -115,7 +115,6 @@ class ResultFiles:
                 raise UsageError(f"--{name} {path} must end in {suffix}")
 
 
-@expand_options
 def replay(
     context: typer.Context,
     recording: Annotated[Path, typer.Argument(help="Folder (the parent of mav0 for EuRoC) or file.")],
@@ -126,7 +125,6 @@ def replay(
         int | None,
         typer.Option(min=1, help="Version of the map in --store, drafts included; default: the current one."),
     ] = None,
-    config: ConfigFile = None,
 ) -> None:
     """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: never localized.
 

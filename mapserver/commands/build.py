@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
 
@@ -34,7 +33,6 @@ class BuildCommandOptions(SurveyOptions):
     ] = None
 
 
-@expand_options
 def build(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
@@ -48,7 +46,6 @@ def build(
     trajectory_scale: Annotated[
         float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
     ] = None,
-    config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     check_output("--trajectory-out", options.trajectory_out)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fleetmap.cli_options import Group, expand_options
+from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError, disk_errors
 from mapserver.commands import options
 
@@ -22,7 +22,6 @@ _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the building
 _FORM, _RMF_FORM = "SITE=LEVEL@HEIGHT", "SITE=LEVEL"
 
 
-@expand_options
 def align(
     *,
     where: options.SiteOptions,
@@ -89,7 +88,6 @@ def _alignment_words(found: "Alignment", corners: "Array", level: str) -> Iterat
     yield f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id building --child-frame-id map"
 
 
-@expand_options
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON of polygons, in metres.")],
     where: options.SiteOptions,
@@ -108,7 +106,6 @@ def import_(
     typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
 
 
-@expand_options
 def remove_areas(where: options.SiteOptions, by: options.ActorOptions) -> None:
     """Delete the areas of a site; their past counts stay."""
     from mapserver.fleet.building import keep_areas
@@ -118,7 +115,6 @@ def remove_areas(where: options.SiteOptions, by: options.ActorOptions) -> None:
     typer.echo(f"site {where.site} has no areas")
 
 
-@expand_options
 def list_areas(where: options.SiteOptions, json: options.Json = False) -> None:
     """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
     with options.open_store(where.store, read_only=True) as maps:
@@ -129,7 +125,6 @@ def list_areas(where: options.SiteOptions, json: options.Json = False) -> None:
     options.print_result(areas.geojson(where.site), [*lines, f"{len(lines)} areas"], json=json)
 
 
-@expand_options
 def export(
     where: options.SiteOptions,
     keep_out: Annotated[
@@ -163,7 +158,6 @@ AREAS = Group(
 )
 
 
-@expand_options
 def set_(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the building; default: the file's.")] = "",
     *,
@@ -192,7 +186,6 @@ def set_(
         typer.echo(f"note: {', '.join(lifts)}: {words}", err=True)
 
 
-@expand_options
 def remove_building(name: _Name, *, store: options.StoreFolder, by: options.ActorOptions) -> None:
     """Let the floors of a building be sites of their own again; their maps stay."""
     from mapserver.fleet import building
@@ -202,7 +195,6 @@ def remove_building(name: _Name, *, store: options.StoreFolder, by: options.Acto
     typer.echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
 
 
-@expand_options
 def list_buildings(
     *,
     store: options.StoreFolder,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, Group, expand_options, settings_of
+from fleetmap.cli_options import Group, settings_of
 from fleetmap.errors import UsageError
 from fleetmap.log_lines import printable
 from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder, open_store, print_result, write_output
@@ -23,7 +23,6 @@ def report(
     site: SiteName,
     store: StoreFolder,
     hours: Annotated[int, typer.Option(min=1, max=9600, help="Hours to look back.")] = 24,
-    config: ConfigFile = None,
 ) -> None:
     """Write a one-page report for the shift leader: failures per robot-day, worst robots, versions, causes, tiles to resurvey."""
     from mapserver.dashboard.shift_page import html_page
@@ -70,7 +69,6 @@ def resurvey(
         Path | None, typer.Option(metavar="FILE", help="Write the route: .csv, or GeoJSON for any other name.")
     ] = None,
     json: Json = False,
-    config: ConfigFile = None,
 ) -> None:
     """List the tiles to resurvey with reasons, requested tiles first; --route writes a route through them."""
     from fleetmap.encoding import to_json
@@ -127,7 +125,6 @@ def replay(
         raise typer.Exit(done.returncode)
 
 
-@expand_options
 def remove(
     failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
     store: StoreFolder,

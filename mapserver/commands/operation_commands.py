@@ -5,7 +5,7 @@ from typing import Any
 
 import typer
 
-from fleetmap.cli_options import Command, Commands, ConfigFile, Group, expand_options, settings_of
+from fleetmap.cli_options import Command, Commands, Group, settings_of
 from mapserver.api.operations import OPERATIONS, Caller, Operation
 from mapserver.commands.options import ActorOptions, StoreFolder, open_store
 
@@ -25,9 +25,7 @@ def with_operations(commands: Commands) -> Commands:
 def _command(operation: Operation) -> Command:
     """The command of an operation: its own parameters, the store, and who acts."""
 
-    def run(
-        *, context: typer.Context, store: StoreFolder, by: ActorOptions, config: ConfigFile = None, **own: Any
-    ) -> None:
+    def run(*, context: typer.Context, store: StoreFolder, by: ActorOptions, **own: Any) -> None:
         with open_store(store) as maps:
             done = operation.run(Caller(maps, by.named(), settings_of(context)), **own)
         typer.echo(done.words)
@@ -36,4 +34,4 @@ def _command(operation: Operation) -> Command:
     own = [item.replace(kind=Parameter.KEYWORD_ONLY) for item in operation.parameters.values()]
     run.__doc__ = operation.run.__doc__
     run.__signature__ = Signature([*own, *general])  # type: ignore[attr-defined]
-    return expand_options(run)
+    return run

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, Group, settings_of
+from fleetmap.cli_options import Group, settings_of
 from mapserver.api.operations.incidents import InboxFolder
 from mapserver.commands.options import Json, StoreFolder, open_store, print_result, table
 
@@ -42,7 +42,6 @@ def list_incidents(
     site: Site = None,
     inbox: InboxFolder = None,
     json: Json = False,
-    config: ConfigFile = None,
 ) -> None:
     """List alerts, refused drafts, recordings that are held or bad, and failures in work, with their state and who has them."""
     from mapserver.api.incidents import incidents

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
+from fleetmap.cli_options import config_path, settings_of
 from fleetmap.errors import UsageError, disk_errors
 from mapserver.commands.options import StoreFolder, open_store
 
@@ -100,7 +100,6 @@ class HttpOptions:
         )
 
 
-@expand_options
 def serve(
     context: typer.Context,
     store: StoreFolder,
@@ -117,7 +116,6 @@ def serve(
             help="Folder of inboxes, DIR/SITE, for uploads and builds of operators; created if it does not exist.",
         ),
     ] = None,
-    config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, exits with status 0 on SIGTERM or SIGINT."""
     from mapserver.serving.http_connections import raise_file_limit

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from fleetmap.cli_options import settings_of
 from fleetmap.errors import BusyError, StoreError, UsageError
 from mapserver.commands import options
 
@@ -40,7 +40,6 @@ def _findings(store: Path, found: "StoreFindings") -> Iterator[str]:
     yield "clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore"
 
 
-@expand_options
 def gc(
     *,
     store: options.StoreFolder,
@@ -87,7 +86,6 @@ def gc(
     options.print_result(garbage, words, json=json)
 
 
-@expand_options
 def retention(
     context: typer.Context,
     *,
@@ -96,7 +94,6 @@ def retention(
         Path | None, typer.Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
     ] = None,
     dry_run: DryRun = False,
-    config: ConfigFile = None,
     json: options.Json = False,
 ) -> None:
     """Remove reports, pictures and recordings that are older than their periods, as the nightly job does.
@@ -144,7 +141,6 @@ def export(
     typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
 
 
-@expand_options
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File written by `mapserver export`.")],
     store: options.NewStoreFolder,

@@ -1,7 +1,8 @@
 """Options of commands: frozen dataclasses that typer shows as options, and a TOML file that gives their defaults.
 
-A command takes a group of options as one value of a dataclass whose fields are annotated as typer's parameters are;
-`expand_options` shows typer the fields. The configuration file has a section for each command, derived from its signature.
+A command takes a group of options as one value of a dataclass whose fields are annotated as typer's parameters are; `expand_options` shows
+typer the fields, and --config where a command takes typer's context, which then has the settings of that file. The configuration file has a
+section for each command, derived from its signature.
 """
 
 import dataclasses
@@ -38,7 +39,7 @@ Commands = Mapping[str, Command | Group]
 
 
 def expand_options(command: Command) -> Command:
-    """Replace the dataclass parameters of a command by their fields, as separate options."""
+    """Replace the dataclass parameters of a command by their fields, as separate options; add --config unless it has an own one."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
@@ -47,9 +48,15 @@ def expand_options(command: Command) -> Command:
             groups[name] = parameter.annotation
             shown = [*inspect.signature(groups[name], eval_str=True).parameters.values()]
         parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in shown]
+    names = {parameter.name for parameter in parameters}
+    has_file = "context" in names and "config" not in names
+    if has_file:
+        parameters.append(inspect.Parameter("config", parameters[0].kind, default=None, annotation=ConfigFile))
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
+        if has_file:
+            del values["config"]  # its callback took it
         for name, kind in groups.items():
             values[name] = kind(**{field.name: values.pop(field.name) for field in dataclasses.fields(kind)})
         command(**values)
@@ -93,10 +100,10 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hoo
         if isinstance(command, Group):
             group = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None, help=command.help)
             for inner_name, inner in command.commands.items():
-                group.command(inner_name)(inner)
+                group.command(inner_name)(expand_options(inner))
             app.add_typer(group, name=name)
         else:
-            app.command(name)(command)
+            app.command(name)(expand_options(command))
     return app
 
 
@@ -104,7 +111,7 @@ def options_of(command: Command) -> dict[str, inspect.Parameter]:
     """Options of a command by their keys in the file; --config has none."""
     return {
         name.rstrip("_"): parameter
-        for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
+        for name, parameter in inspect.signature(expand_options(command)).parameters.items()
         if name != "config"
         and any(isinstance(m, typer.models.OptionInfo) for m in getattr(parameter.annotation, "__metadata__", ()))
     }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
+from fleetmap.cli_options import TopicNames, settings_of
 from fleetmap.errors import RecordingError, UsageError
 from mapserver.commands.options import Calibration, SiteOptions, open_store, topics_of, version_named, write_output
 
@@ -45,12 +45,10 @@ class AcceptOptions(SiteOptions):
     ] = False
 
 
-@expand_options
 def accept(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Drives through the site.")],
     options: AcceptOptions,
-    config: ConfigFile = None,
 ) -> None:
     """Report where and how well robots will be localised at a site, from a version and drives through it.
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import expand_options
 from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_result, shown_progress
 from mapserver.commands.store import EXIT_STATUS_FAULTS
 
@@ -44,7 +43,6 @@ def backup(
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
 
-@expand_options
 def restore(
     target: Where,
     *,

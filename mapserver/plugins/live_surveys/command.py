@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options
+from fleetmap.cli_options import config_path
 from fleetmap.errors import LinkError, UsageError
 from mapserver.commands.options import SurveyOptions, open_store
 
@@ -42,12 +42,10 @@ class LiveCommandOptions(SurveyOptions):
     insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines connect to --foxglove.")] = False
 
 
-@expand_options
 def live(
     context: typer.Context,
     options: LiveCommandOptions,
     recording: Annotated[Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
-    config: ConfigFile = None,
 ) -> None:
     """Map a survey during the drive; Ctrl-C ends the drive and stores a draft."""
     options.check()

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, TopicNames, expand_options
+from fleetmap.cli_options import TopicNames
 from fleetmap.errors import RecordingError, UsageError
 from mapserver.commands.options import (
     Calibration,
@@ -37,12 +37,10 @@ class MarkerOptions(SiteOptions):
     topic: TopicNames = None
 
 
-@expand_options
 def markers(
     context: typer.Context,
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Survey of the version.")],
     options: MarkerOptions,
-    config: ConfigFile = None,
 ) -> None:
     """Measure where the markers of a site stand, by a version and the recording that it was built from."""
     from fleetmap.encoding import to_json

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
+from fleetmap.cli_options import settings_of
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.commands.options import SurveyOptions
 
@@ -23,8 +23,7 @@ class NightlyOptions(SurveyOptions):
     ] = 300.0
 
 
-@expand_options
-def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile = None) -> None:
+def nightly(context: typer.Context, options: NightlyOptions) -> None:
     """Check, build, judge and publish the recordings in the inbox; one run at a time for each site.
 
     Status 0 also for an empty inbox, 4 if the gate refuses, 5 if another run is at work.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, TopicNames, config_path
+from fleetmap.cli_options import TopicNames, config_path
 from fleetmap.errors import RecordingError, UsageError, disk_errors
 from mapserver.commands.options import Calibration, check_output, print_result, table, topics_of
 
@@ -35,7 +35,6 @@ def calibrate(
             metavar="WxH:M", help="Without a calibration: raw image size and metres between the cameras, 752x480:0.11."
         ),
     ] = None,
-    config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
 
