@@ -71,10 +71,9 @@ class SurveyOptions(SiteOptions):
     ] = None
     report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report to this file.")] = None
     threads: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: one per core.")] = None
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...)."),
-    ] = None
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...).")] = (
+        None
+    )
 
     def build_options(self, context: typer.Context, **more: Any) -> "BuildOptions":
         """Return the options of a build, with additions."""

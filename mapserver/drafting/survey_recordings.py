@@ -77,8 +77,9 @@ class RecordingSurvey:
 
     def remarks(self) -> list[str]:
         """Shortcomings of the recording, corrections and left-out parts, as text."""
+        by = "the adjusted survey", "an earlier survey of this rig: this one cannot judge its pair"
         turned = [
-            f"corrected: disparities{of_view} by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by {yaw.source}"
+            f"corrected: disparities{of_view} by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by {by[yaw.is_earlier]}"
             for of_view, yaw in self._yaws()
             if yaw.corrected
         ]
@@ -382,7 +383,6 @@ def survey_recording(
     tools: SurveyTools,
 ) -> list[RecordingSurvey]:
     """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages.
-
 
     One from which the robot was lifted has several surveys: each part is a drive of its own, which finds its place in the map or does not.
     """

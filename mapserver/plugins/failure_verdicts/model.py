@@ -25,10 +25,8 @@ _SENSOR = {Cause.CALIBRATION, Cause.OVERLOADED, Cause.ODOMETRY, Cause.NO_MAP}
 _NEAR_M = 2.5  # racks are moved by less, look-alikes lie farther
 _FARTHEST_M = 1e6
 _LEAST_EXPECTED, _EMPTY_SHARE = 5, 0.25  # landmarks of a cell, and the share of the usual ones below which it is empty
-_LEAST_USUAL, _TYPICAL = (
-    0.1,
-    0.33,
-)  # of the expected landmarks, seen by a sound robot: at least, and where it is not known
+# Of the expected landmarks, seen by a sound robot: at least, and where it is not known
+_LEAST_USUAL, _TYPICAL = 0.1, 0.33
 # Assumptions: that within a week another robot fails in this tile, or this one in another tile, if it is not the reason, and if it is.
 _BY_CHANCE, _BY_REASON, _MOST_OTHERS = 0.05, 0.5, 3
 
@@ -70,9 +68,8 @@ def figures(report: FailureReport, evidence: FailureEvidence) -> list[float]:
     is_far, is_nowhere = float(wrong_m is not None and not is_near), float(wrong_m is None and not apart and is_seen)
     found = [
         float(cause in _IMAGE),
-        float(
-            cause in _SENSOR or bool(evidence.flags)
-        ),  # a calibration that fixes contradict blames neither: racks move too
+        # A calibration that fixes contradict blames neither: racks move too
+        float(cause in _SENSOR or bool(evidence.flags)),
         1.0 - evidence.view_percent / 100.0,
         float(evidence.broke),
         float(cause == Cause.CARRIED),

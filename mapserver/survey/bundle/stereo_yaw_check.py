@@ -37,15 +37,6 @@ class StereoYaw:
     is_earlier: bool = False
 
     @property
-    def source(self) -> str:
-        """What measured it, as text."""
-        return (
-            "an earlier survey of this rig: this one cannot judge its pair"
-            if self.is_earlier
-            else "the adjusted survey"
-        )
-
-    @property
     def correction_px(self) -> float:
         """Correction that the survey subtracts."""
         return self.shift_px if self.corrected else 0.0
