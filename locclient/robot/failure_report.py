@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import known_radius_m
 from fleetmap.features.extraction import extract
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, se3_inverse
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import (
     MAX_THUMBNAIL_BYTES,
@@ -37,7 +37,7 @@ from locclient.robot.failure_onset import AGREEING_FIXES, PICTURE_WIDTH_PX
 from locclient.robot.robot import FailureContext
 
 Canvas = NDArray[np.uint8]
-Matches = tuple[Array, Array, NDArray[np.int64], Array]
+Matches = tuple[Array, Array, Indices, Array]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
 _LETTERS = 0.55  # font scale of the title, if it fits
 _MATCHES_WIDTH_PX = 800
@@ -221,7 +221,7 @@ def _evidence(
     )
 
 
-def _has_map_changed(context: FailureContext, profile: RobotProfile, hit: NDArray[np.int64]) -> bool:
+def _has_map_changed(context: FailureContext, profile: RobotProfile, hit: Indices) -> bool:
     """Return True if far fewer landmarks than expected were found at a known place, with good images and odometry.
 
     The map must expect twice the landmarks of a fix, at the robot's recall until then, and less than half of them are seen. hit: as of

@@ -6,14 +6,13 @@ from itertools import count, pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_exps, so3_log
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated, imu_intervals, preintegrate
 from fleetmap.sensors.calibration import ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
+from fleetmap.sensors.samples import ImuSamples, Stamps, WheelSample, wheel_between
 from mapserver.calibration.parameters import LENS_SIGMAS
 from mapserver.survey.bundle.bundle_adjustment import FLOOR_SIGMA, packed_increments
 from mapserver.survey.state import RelativeTerm
@@ -43,7 +42,7 @@ class CalibrationData:
 
     calibration: RigCalibration
     rectifier: Rectifier
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Stamps
     start: MotionState
     obs_keyframe: AnyArray
     obs_landmark: AnyArray

@@ -10,7 +10,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, rotation_angle_rad
+from fleetmap.geometry import Array, Indices, Mask, rotation_angle_rad
 from fleetmap.recordings.recording import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -94,7 +94,7 @@ def followed(
     return busiest_stretch(begin_survey(inputs, settings, tools), (rig, rectifier), recording.wheel)
 
 
-def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
+def busiest_frames(stamps: Stamps, imu: ImuSamples) -> Indices:
     """Return the numbers of the frames of the LONGEST_S seconds with the most motion by gyro and accelerometer, the first without IMU."""
     last = np.searchsorted(stamps, stamps + int(LONGEST_S * 1e9))
     starts = np.flatnonzero(last < len(stamps))
@@ -152,7 +152,7 @@ def busiest_stretch(
     )
 
 
-def _busiest(state: SurveyState) -> NDArray[np.bool_]:
+def _busiest(state: SurveyState) -> Mask:
     """Return (K,) the run of keyframes with the most rotation, all of them if they are few."""
     count = len(state.stamps_ns)
     chosen = np.ones(count, bool)

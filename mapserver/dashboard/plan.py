@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.mapformat.manifest import Manifest, TileEntry
 from fleetmap.mapformat.tile import Tile
 from mapserver.quality.directions import tile_directions
@@ -97,7 +97,7 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def _pixels(points: Array, low: Array, high: Array, scale_m: float, height: int) -> tuple[NDArray[np.int64], ...]:
+def _pixels(points: Array, low: Array, high: Array, scale_m: float, height: int) -> tuple[Indices, ...]:
     """Rows and columns of the points that are in the picture; y points up."""
     inside = ((points >= low) & (points < high)).all(axis=1)
     columns, rows = ((points[inside] - low) / scale_m).astype(np.int64).T

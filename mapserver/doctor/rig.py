@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
+from fleetmap.geometry import Array, Mask, se3, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.calibration import CalibrationParameter as P
@@ -201,7 +200,7 @@ def _linearized(first: Array, other: Array) -> tuple[Array, Array]:
     return rows, residuals
 
 
-def _aligned(first: Array, other: Array, has_way: NDArray[np.bool_]) -> Array:
+def _aligned(first: Array, other: Array, has_way: Mask) -> Array:
     """Rotation (3, 3) that turns the other view's rotations and translations nearest to the first one's, by none where they do not show.
     Source: Kabsch 1976."""
     turns = [np.array([so3_log(motion[:3, :3]) for motion in each]) for each in (first, other)]

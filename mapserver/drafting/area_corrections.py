@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fleetmap.geometry import AnyArray, Array, Rings, inside_any
+from fleetmap.geometry import AnyArray, Array, Mask, Rings, inside_any
 from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.draft_evidence import Before
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
@@ -21,7 +21,6 @@ from mapserver.survey.merge.changes import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Mask
 from mapserver.survey.survey_map import SurveyMap
 
 

@@ -16,7 +16,7 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.errors import RecordingError
 from fleetmap.failure_definition import is_wrong
 from fleetmap.features.settings import OrbSettings
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
 from fleetmap.mapformat.tile import Tile, decode_tile, encode_tile
 from fleetmap.recordings import Recording
@@ -164,7 +164,7 @@ class TileChooser(NamedTuple):
     settings: BudgetSettings
     published: NDArray[np.uint32] | None
     vocabulary: Vocabulary
-    frozen: NDArray[np.bool_] | None = None
+    frozen: Mask | None = None
 
     def choose(self, views: Sequence[AskedView]) -> tuple[list[Tile], SurveyedViews]:
         """Return the tiles, and which views give no fix in them.
@@ -271,7 +271,7 @@ class Before:
         counts = {f"{tile.tile_x},{tile.tile_y}": int(np.isin(tile.landmark_ids, ids).sum()) for tile in self.tiles}
         return {name: count for name, count in counts.items() if count}
 
-    def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
+    def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, Mask] | None:
         """Return (F, 4, 4) map_from_body of a recording's frames from the build of this version, and a mask (F,) of usable ones.
 
         Keyframes are excluded; None if the version was built without it.
@@ -290,7 +290,7 @@ class Before:
 def replayed_probes(
     paths: Sequence[Path],
     before: Before,
-    opened: Callable[[Path], tuple[Recording, NDArray[np.int64]]],
+    opened: Callable[[Path], tuple[Recording, Indices]],
     seen_by: tuple[StereoCamera, OrbSettings],
 ) -> list[Probe]:
     """Return frames of earlier recordings with their poses in the version built from them; none of unknown recordings.

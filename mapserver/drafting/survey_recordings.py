@@ -10,12 +10,11 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.config import Section, load_toml
 from fleetmap.errors import FleetmapError, RecordingError, SurveyError, UsageError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.manifest import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
@@ -51,7 +50,7 @@ from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Watch, Zones
 
 _log = logging.getLogger(__name__)
-_Opened = tuple[Recording, NDArray[np.int64]]
+_Opened = tuple[Recording, Indices]
 
 
 @dataclass(frozen=True)
@@ -127,10 +126,10 @@ class StartPoses(Protocol):
     @property
     def file(self) -> Path: ...
 
-    def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
+    def seen(self, recording: Recording, indices: Indices) -> tuple[Recording, Indices]:
         """Return the recording with what the system measured beside poses, and which of the selected frames (F,) can be used."""
 
-    def poses_of(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+    def poses_of(self, recording: Recording, indices: Indices) -> GivenPoses:
         """Return the poses of the selected frames (F,); an error if they do not fit the recording."""
 
 
@@ -218,7 +217,7 @@ class RecordedParts:
     """
 
     recording: Recording
-    indices: NDArray[np.int64]
+    indices: Indices
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -235,7 +234,7 @@ class RecordedParts:
 
 
 def survey_inputs_of(
-    recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
+    recording: Recording, indices: Indices, rectifier: Rectifier, given: Trajectory | None
 ) -> SurveyInputs:
     """Return the selected frames (F,) of a recording, read ahead, and its samples."""
     frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
@@ -250,9 +249,7 @@ _TRIED_S = 120.0  # of a drive tracked as a whole under a calibration that is on
 class BegunSurvey:
     """The first stages of a recording's survey, which also measure its calibration: they run only once if that is right."""
 
-    def __init__(
-        self, whole: Recording, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools
-    ) -> None:
+    def __init__(self, whole: Recording, indices: Indices, settings: SurveySettings, tools: SurveyTools) -> None:
         """whole: with all cameras of its rig, of which the calibration concerns the first. indices (F,): of the selected frames."""
         self._whole, self._indices, self._settings, self._tools = whole, indices, settings, tools
         self._made: tuple[RigCalibration, bool, AdjustedChain] | None = None
@@ -280,7 +277,7 @@ class BegunSurvey:
         return self._made[2]
 
     @staticmethod
-    def suits(recording: Recording, indices: NDArray[np.int64], *, is_only: bool = True) -> bool:
+    def suits(recording: Recording, indices: Indices, *, is_only: bool = True) -> bool:
         """True if the selected frames are consecutive, and as informative as any stretch; and not many, where other drives wait as long."""
         stamps_ns = recording.frame_stamps_ns[indices]
         seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
@@ -428,12 +425,12 @@ def survey_recording(
 
 def _by_parts(
     recording: Recording,
-    parts: list[NDArray[np.int64]],
+    parts: list[Indices],
     rectifier: Rectifier,
     options: SurveyConfig,
     tools: SurveyTools,
     said: list[str],
-) -> list[tuple[Recording, NDArray[np.int64], Survey]]:
+) -> list[tuple[Recording, Indices, Survey]]:
     """Return each part with its frames and its survey, and add remarks to those said. SurveyError if none can be surveyed."""
     done = []
     for number, chosen in enumerate(parts, 1):
@@ -449,7 +446,7 @@ def _by_parts(
     return done
 
 
-def _between(recording: Recording, chosen: NDArray[np.int64], rectifier: Rectifier, name: str) -> Recording:
+def _between(recording: Recording, chosen: Indices, rectifier: Rectifier, name: str) -> Recording:
     """Return a recording with the samples and the truth of its chosen frames alone, under a name."""
     first_ns, last_ns = recording.frame_stamps_ns[chosen[[0, -1]]].tolist()
     offset_ns, truth = int(rectifier.imu_minus_cam_s * 1e9), recording.ground_truth

@@ -11,11 +11,10 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.encoding import decode_json, to_json, to_plain
 from fleetmap.errors import InvalidValueError, StateError
-from fleetmap.geometry import Array, Rings, inside_any, inside_rings, se3_inverse, transform_points
+from fleetmap.geometry import Array, Mask, Rings, inside_any, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import Manifest
 
@@ -133,7 +132,7 @@ class Area:
             if not any(inside_rings(ring, [other]).mean() >= 0.5 for other in polygon if other is not ring)
         ]
 
-    def holds(self, points_m: Array) -> NDArray[np.bool_]:
+    def holds(self, points_m: Array) -> Mask:
         """Return a mask (N,) of the points (N, 2) inside."""
         return inside_any(points_m, self.polygons)
 

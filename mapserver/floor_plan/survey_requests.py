@@ -7,9 +7,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, inside_rings
+from fleetmap.geometry import Array, Mask, inside_rings
 
 KIND = "survey request "
 """Prefix of a request's kind among the files of a site; its id follows."""
@@ -87,7 +86,7 @@ def courses(events: Iterable[tuple[int, str, str]]) -> list[SurveyCourse]:
     return list(found.values())[::-1]
 
 
-def near_drives(places_map_m: Array, driven_map_m: Array) -> NDArray[np.bool_]:
+def near_drives(places_map_m: Array, driven_map_m: Array) -> Mask:
     """Return (K,) which places (K, 2) are within 2 m of a driven position (F, 2)."""
     if not len(driven_map_m):
         return np.zeros(len(places_map_m), bool)

@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from mapserver.quality.figures import TileDirections, first_of
 
 HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
@@ -17,7 +16,7 @@ _UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the c
 _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisle
 
 
-def headings_of(map_from_cam: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+def headings_of(map_from_cam: Array) -> tuple[Indices, Mask, Mask]:
     """Return the numbers of the HEADINGS of places (K, 4, 4), which of them look neither up nor down, and which of those are one-way: no
     place near them looks the other way."""
     axes_map = map_from_cam[:, :2, 2]

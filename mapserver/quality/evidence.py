@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.failure_definition import ERROR_LIMIT_M, is_wrong
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.geometry import Array, Mask, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import MapView, places_around
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
@@ -172,7 +172,7 @@ def aliasing(probed: Sequence[ProbeFixes]) -> Aliasing | None:
 
 
 def trajectory_breaks(
-    stamps_ns: Stamps, map_from_body: Array, odom_from_body: Array, covariances: Array, tracked: NDArray[np.bool_]
+    stamps_ns: Stamps, map_from_body: Array, odom_from_body: Array, covariances: Array, tracked: Mask
 ) -> TrajectoryBreaks | None:
     """Find differences between a survey's trajectory and odometry, over stretches of three metres; None if it is shorter.
 

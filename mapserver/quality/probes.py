@@ -6,12 +6,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.features.extraction import extract
 from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.relocalization.alias_search import AliasCandidate
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView, most_similar, places_around
 from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, FrameFeatures, Relocalizer, is_reliable, with_depth
@@ -96,7 +95,7 @@ class _Search(Relocalizer):
     def at_alias(self, query: FrameFeatures, alias: AliasCandidate, seen: Fix) -> Fix | None:
         return self._once("alias", id(alias), super().at_alias, query, alias, seen)
 
-    def fixes(self, allowed: NDArray[np.bool_] | None) -> list[Fix]:
+    def fixes(self, allowed: Mask | None) -> list[Fix]:
         """Return all verified fixes at allowed places (K,), best first."""
         return finished(self.anywhere(self._query, allowed))
 
@@ -106,7 +105,7 @@ class _Search(Relocalizer):
         fixes = self.fixes(places_around(self.view.map_from_cam, *around))
         return next((fix for fix in _reliable(fixes) if places_around(fix.map_from_cam[None], *around).all()), None)
 
-    def most_similar(self, allowed: NDArray[np.bool_]) -> Array | None:
+    def most_similar(self, allowed: Mask) -> Array | None:
         """Return (4, 4) map_from_cam of the most similar allowed place (K,); None without any."""
         places = most_similar(self.similarities(self._query), allowed, 1)
         return np.asarray(self.view.map_from_cam[places[0]]) if len(places) else None
@@ -149,12 +148,12 @@ def _with_prior(search: _Search, probe: Probe) -> ProbeFixes:
     return ProbeFixes(probe, search.around(probe.map_from_cam), is_misled)
 
 
-def _is_far(view: MapView, probe: Probe) -> NDArray[np.bool_]:
+def _is_far(view: MapView, probe: Probe) -> Mask:
     away_m = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1)
     return np.asarray(away_m > ELSEWHERE_M)
 
 
-def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
+def spread(numbers: Indices, count: int) -> list[int]:
     """Return at most `count` of the numbers, evenly spread."""
     if len(numbers) <= count:
         return [int(number) for number in numbers]

@@ -4,9 +4,8 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log, transport_cov
+from fleetmap.geometry import Array, Mask, rotation_between_vectors, se3, se3_inverse, so3_log, transport_cov
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.odometry.mono.mono_modes import make_odometry
@@ -344,9 +343,7 @@ def parts_between_lifts(estimates: Sequence[OdometryEstimate]) -> list[slice]:
     return [slice(a, b) for a, b in runs if b > a and stamps_ns[b - 1] - stamps_ns[a] > WINDOW_NS]
 
 
-def _levelled(
-    odom_from_body: Array, covariances: Array, body_from_cam: Array, chosen: NDArray[np.bool_]
-) -> tuple[Array, Array]:
+def _levelled(odom_from_body: Array, covariances: Array, body_from_cam: Array, chosen: Mask) -> tuple[Array, Array]:
     """Rotate the pass so that z points up, without an accelerometer: cameras are assumed upright on average."""
     down = (odom_from_body[chosen, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
     if np.linalg.norm(down) < 1e-6:

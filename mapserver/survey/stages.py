@@ -19,11 +19,10 @@ those of single cameras beside a pair are triangulated once, before loop closure
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.frame_adjustment import place_frames
@@ -54,7 +53,7 @@ from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_
 from mapserver.survey.rig import rig_of
 from mapserver.survey.segments import in_segments
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Landmarks, Mask, OdometryPass, RigImages, SurveyState, image_numbers
+from mapserver.survey.state import Landmarks, OdometryPass, RigImages, SurveyState, image_numbers
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
@@ -76,7 +75,7 @@ class Survey:
     """
 
     map: SurveyMap
-    landmarks_in_map: NDArray[np.int64]
+    landmarks_in_map: Indices
     vocabulary: Vocabulary
     loops: Loops
     odometry: OdometryPass
@@ -84,7 +83,7 @@ class Survey:
     culled: Culled
     stereo_yaws: tuple[StereoYaw, ...]
     components: list[Component]
-    seen: NDArray[np.bool_]
+    seen: Mask
 
 
 def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:

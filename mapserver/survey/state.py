@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features import orb, patch_align
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import AnyArray, Array, transform_points
+from fleetmap.geometry import AnyArray, Array, Indices, Mask, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import ImuSamples
+from fleetmap.sensors.samples import ImuSamples, Stamps
 from mapserver.survey.rig import Rig, scaled_bodies
 
-Indices = NDArray[np.int64]
 Numbers = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +377,7 @@ class SurveyState:
     priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`.
     """
 
-    stamps_ns: Indices
+    stamps_ns: Stamps
     map_from_body: Array
     rig: Rig
     motion: KeyframeMotion

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
-from fleetmap.geometry import Array, transform_points
+from fleetmap.geometry import Array, Mask, transform_points
 from fleetmap.relocalization.map_view import ViewingCones
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Stamps, Trajectory
@@ -22,7 +22,7 @@ class History:
     """
 
     keyframe_ids: NDArray[np.uint32]
-    is_place: NDArray[np.bool_]
+    is_place: Mask
     landmark_expected: NDArray[np.uint32]
     landmark_seen: NDArray[np.uint32]
     landmark_missed: NDArray[np.uint32]
@@ -56,7 +56,7 @@ class SurveyMap:
     obs_octave: NDArray[np.int8]
     obs_sigma_px: Array
     trajectory: Trajectory
-    trajectory_estimated: NDArray[np.bool_]
+    trajectory_estimated: Mask
     patches: NDArray[np.uint8]
     history: History | None = None
     scale_known: bool = True

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import SurveyError
 from fleetmap.features.matching import packed
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, se3_inverse
 from fleetmap.mapformat.tile import Tile
 from mapserver.survey.merge.landmark_persistence import PRIOR_COUNT
 from mapserver.survey.settings import BudgetSettings
@@ -27,7 +27,7 @@ MAX_PLACE_LANDMARKS = 300
 _Ids = NDArray[np.uint32]
 
 
-def tiles_from_survey(survey: SurveyMap, chosen: NDArray[np.bool_] | None = None) -> list[Tile]:
+def tiles_from_survey(survey: SurveyMap, chosen: Mask | None = None) -> list[Tile]:
     """Return the survey divided into squares of TILE_SIZE_M, ordered by x, then y.
 
     Landmarks lie in the tile of their position, places (keyframes offered as such, under their ids) in that
@@ -76,12 +76,12 @@ def tiles_from_survey(survey: SurveyMap, chosen: NDArray[np.bool_] | None = None
     return tiles
 
 
-def cells_of(points_map: Array) -> NDArray[np.int64]:
+def cells_of(points_map: Array) -> Indices:
     """Return (N, 2) x and y of the tiles in which points (N, 2 or 3) lie."""
     return np.asarray(np.floor(points_map[:, :2] / TILE_SIZE_M), np.int64)
 
 
-def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], chosen: NDArray[np.bool_]) -> list[_Ids]:
+def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], chosen: Mask) -> list[_Ids]:
     """Return for each keyframe the sorted ids of the best observed chosen landmarks seen in it."""
     ids = survey.landmark_ids
     order = np.lexsort((ids[survey.obs_landmark], -counts[survey.obs_landmark], survey.obs_keyframe))
@@ -102,7 +102,7 @@ _REACH = 6  # neighbours compared among those that agree in two bytes
 _MOST_COMPARED = 10_000  # a landmark without a copy among these counts as unique
 
 
-def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> Mask:
     """Return (N,) which landmarks (N, 3) with descriptors (N, 32) have no copy: no similar one at the same height farther off.
 
     Copies mostly agree in two bytes, and are neighbours after sorting by those; the few without are then compared
@@ -127,7 +127,7 @@ class Sighting(NamedTuple):
     """A view besides the keyframes: map_from_cam (4, 4), its landmarks (P,), rows of the survey, and their pixels (P, 3)."""
 
     map_from_cam: Array
-    landmarks: NDArray[np.int64]
+    landmarks: Indices
     pixels: Array
 
 
@@ -136,7 +136,7 @@ def choose_landmarks(
     settings: BudgetSettings,
     published: NDArray[np.uint32] | None = None,
     sightings: Sequence[Sighting] = (),
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return (N,) which landmarks of the survey robots get.
 
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
@@ -161,7 +161,7 @@ def choose_landmarks(
     for each in sightings:
         matched[each.landmarks] = True
     of_sightings = np.where(np.arange(len(taken)) < keyframes, 0, settings.view_landmarks)
-    passes: list[tuple[NDArray[np.bool_], NDArray[np.int64] | int]] = [(matched, of_sightings)]
+    passes: list[tuple[Mask, Indices | int]] = [(matched, of_sightings)]
     for mask in (first, seen & ~first):
         passes += [(mask & distinct, settings.view_distinctive_landmarks), (mask, settings.view_landmarks)]
         passes.append((mask, _NO_LIMIT))
@@ -193,7 +193,7 @@ def covered_path_m(survey: SurveyMap) -> float:
     return total_m
 
 
-def _views(survey: SurveyMap, sightings: Sequence[Sighting]) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _views(survey: SurveyMap, sightings: Sequence[Sighting]) -> tuple[Indices, Indices, Array]:
     """Return the start of each landmark's bins (N + 1,), the bins (M,) of all observations by landmark, and weights (N,)."""
     count, camera = len(survey.landmark_ids), survey.camera
     map_from_keyframe = survey.map_from_body @ survey.body_from_cam

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 AnyArray = NDArray[Any]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Rings = tuple[Array, ...]
 """A polygon, the outline first, then holes: (V, 2) corners in metres, the first not repeated; inside by the even-odd rule over them."""
 

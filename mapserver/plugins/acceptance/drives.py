@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
 from fleetmap.mapformat.tile import decode_tile
 from fleetmap.messages import Status
@@ -185,8 +184,8 @@ def examined(
 
 
 def _reference(
-    recording: Recording, selected: NDArray[np.int64], version: MapUnderTest, localised: Trajectory
-) -> tuple[str, Trajectory, NDArray[np.bool_]]:
+    recording: Recording, selected: Indices, version: MapUnderTest, localised: Trajectory
+) -> tuple[str, Trajectory, Mask]:
     """Return the best known poses with the name of their source: ground truth in the map's frame, the version's own survey, or the
     localized frames themselves; and the mask (F,) of selected frames that did not make the map."""
     entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Mask
 from fleetmap.sensors.samples import CameraFrame, Image
 
 STOPS = (1, 2, 3, 4, 5)
@@ -55,7 +54,7 @@ def ladders(frame: CameraFrame, seed: int) -> dict[str, Iterator[tuple[int, Came
     return {"darkness": rungs(STOPS, darker), "blur": smeared}
 
 
-def darkest_grey(levels: Array, is_fixed: NDArray[np.bool_]) -> float | None:
+def darkest_grey(levels: Array, is_fixed: Mask) -> float | None:
     """Return the grey level that best divides pictures without a fix, up to it, from those with one; None if no level does.
 
     levels (N,): median grey level of each picture, darkened ones included; is_fixed (N,).

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import UsageError
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, se3, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.plugins.dense_maps.expected_view import expected_depth
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT
@@ -58,7 +58,7 @@ class Changes:
     """
 
     patches: tuple[Patch, ...]
-    layers: dict[str, NDArray[np.bool_]]
+    layers: dict[str, Mask]
     corner_m: Array
 
     def area_m2(self, kind: str) -> float:
@@ -122,7 +122,7 @@ def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
     return low * CELL_M, (rows, columns)
 
 
-def _fill(layer: NDArray[np.bool_], points_map: Array | NDArray[np.float32], corner_m: Array) -> None:
+def _fill(layer: Mask, points_map: Array | NDArray[np.float32], corner_m: Array) -> None:
     columns, rows = np.floor((points_map[:, :2] - corner_m) / CELL_M + 1e-6).astype(np.int64).T
     layer[np.clip(rows, 0, layer.shape[0] - 1), np.clip(columns, 0, layer.shape[1] - 1)] = True
 
@@ -172,7 +172,7 @@ def _counts(points_map: Array, other: SeenSite) -> Array:
     return counts
 
 
-def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
+def _shown(points_map: Array, view: Array, tangent: float) -> Indices:
     """Return the points in the cone of a view, a row of Surfels.exposures."""
     off = points_map - view[:3]
     depth_m = off @ view[3:6]
@@ -180,7 +180,7 @@ def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
     return np.flatnonzero((depth_m > MIN_RANGE_M) & (depth_m < MAX_RANGE_M) & (aside_m < tangent * depth_m))
 
 
-def _joined(points_map: Array) -> list[NDArray[np.int64]]:
+def _joined(points_map: Array) -> list[Indices]:
     """Return rows of points connected by steps of up to a voxel's diagonal."""
     if not len(points_map):
         return []

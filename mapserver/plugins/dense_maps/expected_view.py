@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import CalibrationError, UsageError
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Mask, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.plugins.dense_maps.exposure import lens_factor
@@ -30,7 +30,7 @@ class ExpectedView:
 
     picture: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
-    unknown: NDArray[np.bool_]
+    unknown: Mask
 
 
 def pinhole(camera: StereoCamera) -> CameraCalibration:
@@ -100,7 +100,7 @@ def _drawn(
     return rays, *core.draw_discs(*discs, far_m, RADIUS_EDGES, rays, pixels_per_rad)
 
 
-def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:
+def filled(picture: NDArray[np.float32], unknown: Mask) -> NDArray[np.float32]:
     """Fill unknown pixels of the picture (H, W) smoothly from their neighbours; grey without any. Source: Gortler et al. 1996."""
     known = (~unknown).astype(np.float32)
     if not known.any():

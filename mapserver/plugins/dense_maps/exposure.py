@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.sensors.rectification import StereoCamera
 
 FALLOFF = 3  # coefficients: of the squared tangent of the angle to the axis and of its powers
@@ -18,8 +18,8 @@ _ROUNDS, _HUBER, _MIN_SAMPLES, _PRIOR = 3, 0.1, 200, 1e-2
 class Sample(NamedTuple):
     """N observations of points: point and view (N,), squared tangent of the angle to the axis (N,), logarithm of the grey level (N,)."""
 
-    points: NDArray[np.int64]
-    images: NDArray[np.int64]
+    points: Indices
+    images: Indices
     squared: Array
     logs: Array
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import StateError, UsageError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Mask
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -127,7 +127,7 @@ def refine(splats: Splats, images: Views, steps: int, rng: np.random.Generator) 
         raise StateError("the held-out images show no surfels; choose the recording of this version")
     before = _likeness(splats, parameters, held_out, known)
     mean, square, seen = np.zeros_like(parameters), np.zeros_like(parameters), np.zeros(len(parameters))
-    order, masks = list[int](), dict[int, NDArray[np.bool_]]()
+    order, masks = list[int](), dict[int, Mask]()
     for step in range(steps):
         if not order:
             order = rng.permutation(len(learned)).tolist()
@@ -151,7 +151,7 @@ def refine(splats: Splats, images: Views, steps: int, rng: np.random.Generator) 
     return Refined(with_parameters(splats, parameters), before, after, len(learned), len(held_out))
 
 
-def _likeness(splats: Splats, parameters: Array, looks: Sequence[Look], known: Sequence[NDArray[np.bool_]]) -> Likeness:
+def _likeness(splats: Splats, parameters: Array, looks: Sequence[Look], known: Sequence[Mask]) -> Likeness:
     rows = []
     for look, where in zip(looks, known, strict=True):
         if not where.any():
@@ -166,7 +166,7 @@ def _likeness(splats: Splats, parameters: Array, looks: Sequence[Look], known: S
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
-def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
+def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: Mask) -> float:
     """Return the mean structural similarity of windows around these pixels. Source: Wang et al. 2004 (11 x 11 Gaussian of 1.5 px)."""
 
     def mean(values: Array) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import (
     CELL_M,
@@ -102,7 +102,7 @@ class SessionViews:
 _Part = tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]
 
 
-def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
+def _parts(corner: Indices, size: int) -> Iterator[_Part]:
     """Yield the tiles that a window of `size` cells overlaps: place, part of the tile, part of the window (rows, columns)."""
     first, last = corner // TILE_CELLS, (corner + size - 1) // TILE_CELLS
     for x in range(int(first[0]), int(last[0]) + 1):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.plugins.dense_maps.surfel_map import Surfels
 
@@ -79,7 +79,7 @@ class Drawn:
 
     picture: Array
     through: Array
-    backward: Callable[[Array], tuple[NDArray[np.int64], Array]]
+    backward: Callable[[Array], tuple[Indices, Array]]
 
 
 def parameters_of(splats: Splats) -> Array:
@@ -121,7 +121,7 @@ def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_
     numbers, opacities = numbers[is_seen], opacities[is_seen]
     through, picture = core.blend(gaussians, camera.width_px, camera.height_px)
 
-    def backward(slopes: Array) -> tuple[NDArray[np.int64], Array]:
+    def backward(slopes: Array) -> tuple[Indices, Array]:
         return numbers, core.blend_backward(gaussians, opacities, BLUR_PX2, np.ascontiguousarray(slopes), picture)
 
     return Drawn(picture, through, backward)
@@ -131,9 +131,7 @@ def _determinant(shapes: Array) -> Array:
     return np.asarray(shapes[:, 0] * shapes[:, 2] - shapes[:, 1] ** 2)
 
 
-def _projected(
-    splats: Splats, camera: CameraCalibration, cam_from_map: Array
-) -> tuple[NDArray[np.int64], Array, Array]:
+def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -> tuple[Indices, Array, Array]:
     """Return M splats in a picture, near to far: numbers, pixels (M, 2), and xx, xy, yy (M, 3) of their covariances for a sigma of 1 m.
 
     By EWA splatting: a Gaussian through the projection's derivative at its middle. Source: Zwicker et al. 2001.

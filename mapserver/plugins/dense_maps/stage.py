@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fleetmap.errors import StateError
-from fleetmap.geometry import AnyArray
+from fleetmap.geometry import AnyArray, Mask
 from fleetmap.version_grid import CELL_M, TILE_CELLS, TILE_SIZE_M, Tiles, encode_grid, grid_report, known_grid
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.extras import ChosenDraft, Extra
@@ -23,7 +23,6 @@ from mapserver.plugins.dense_maps.survey_grid import GridGrower, Grower, grow
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from mapserver.store.survey_pictures import PICTURES_KEY, SurveyPicture
-from mapserver.survey.state import Mask
 
 _Place = tuple[int, int]
 _CENTRES_M = (np.stack(np.meshgrid(*[np.arange(TILE_CELLS)] * 2), axis=-1).reshape(-1, 2) + 0.5) * CELL_M  # row by row

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, Indices, Mask
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Manifest, Positive, TileEntry, manifest_entry
 from fleetmap.mapformat.names import sha256_hex
@@ -57,7 +57,7 @@ class Surfels:
     def __len__(self) -> int:
         return len(self.points_map)
 
-    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Surfels":
+    def __getitem__(self, chosen: Mask | Indices) -> "Surfels":
         each = (self.points_map[chosen], self.normals[chosen], self.levels[chosen], self.greys[chosen])
         return Surfels(*each, self.falloff, self.exposures)
 

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, se3_inverse
 from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
@@ -237,7 +237,7 @@ def _points(look: _Look, camera: StereoCamera, step: int) -> Array:
     return np.asarray(points @ look.map_from_cam[:3, :3].T + look.map_from_cam[:3, 3])
 
 
-def _blocks(points_map: NDArray[np.float32]) -> tuple[NDArray[np.int64], list[slice]]:
+def _blocks(points_map: NDArray[np.float32]) -> tuple[Indices, list[slice]]:
     """Return an order of points in which those of a block follow each other, and the rows of each block."""
     places = np.floor(points_map / _BLOCK_M).astype(np.int64) + (1 << 19)
     keys = places @ [1 << 40, 1 << 20, 1]  # on integers, not on rows: thirty times faster
@@ -246,7 +246,7 @@ def _blocks(points_map: NDArray[np.float32]) -> tuple[NDArray[np.int64], list[sl
     return order, [slice(first, last) for first, last in zip([0, *ends], ends, strict=False) if last > first]
 
 
-def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[np.bool_]:
+def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> Mask:
     """Return (N,) True if `other` has the same place, or the one in front of or behind it, at least `finer_by` levels finer."""
     known = np.zeros(len(surfels), bool)
     for level in range(LEVELS):
@@ -263,5 +263,5 @@ def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[
     return known
 
 
-def _keys(points_map: NDArray[np.float32], level: int) -> NDArray[np.int64]:
+def _keys(points_map: NDArray[np.float32], level: int) -> Indices:
     return core.voxel_keys(points_map, np.full(len(points_map), level, np.uint8))

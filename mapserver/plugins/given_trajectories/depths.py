@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, Indices
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame
@@ -75,7 +75,7 @@ class DepthFrames(WrappedFrames):
     """
 
     file: Path
-    rows: NDArray[np.int64]
+    rows: Indices
     camera: CameraCalibration
     scale: float
 
@@ -86,7 +86,7 @@ class DepthFrames(WrappedFrames):
             depth_m = self._depth_m(np.array(self._images[row], np.float32))
         return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m)
 
-    def part(self, indices: NDArray[np.int64]) -> "DepthFrames":
+    def part(self, indices: Indices) -> "DepthFrames":
         return replace(self, source=self.source.part(indices), rows=self.rows[indices])
 
     def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import (
     Array,
+    Indices,
+    Mask,
     quat_wxyz_from_rotation,
     rotation_from_quat_wxyz,
     se3,
@@ -70,7 +71,7 @@ class GivenTrajectory:
                 f"--trajectory-scale {self.scale}: invalid; give the metres in the file's unit of length, above 0"
             )
 
-    def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
+    def seen(self, recording: Recording, indices: Indices) -> tuple[Recording, Indices]:
         """Return a single camera's recording with depth from `disps.npy` beside DROID's poses, and the selected frames that have a depth.
 
         Unchanged if there is no such file or the recording needs none. UsageError without a scale, which one camera cannot
@@ -110,7 +111,7 @@ class GivenTrajectory:
         )
         return seen, indices[has_depth]
 
-    def poses_of(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+    def poses_of(self, recording: Recording, indices: Indices) -> GivenPoses:
         """Return the poses of the selected frames (F,).
 
         Frames without poses get them from fleetmap's odometry between those with poses. UsageError for a single camera with unknown
@@ -173,7 +174,7 @@ class OwnMotion(NamedTuple):
 
     stamps_ns: Stamps
     frame_from_body: Array
-    piece: NDArray[np.int64]
+    piece: Indices
     body_from_cam: Array
 
     def body_from(self, reading: PoseReading) -> Array:
@@ -230,7 +231,7 @@ def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
     return Trajectory(trajectory.stamps_ns, se3_inverse(matrices) if reading.is_inverted else matrices)
 
 
-def stretches(followed: OwnMotion, known: NDArray[np.bool_]) -> NDArray[np.int64]:
+def stretches(followed: OwnMotion, known: Mask) -> Indices:
     """Return (P, 2) consecutive numbers of frames with poses: between each pair there was enough rotation, translation or time."""
     found: list[tuple[int, int]] = []
     for piece in np.unique(followed.piece[followed.piece >= 0]):
@@ -248,7 +249,7 @@ def stretches(followed: OwnMotion, known: NDArray[np.bool_]) -> NDArray[np.int64
 
 
 def judge(
-    as_read: Trajectory, reading: PoseReading, followed: OwnMotion, pairs: NDArray[np.int64], scale: float | None
+    as_read: Trajectory, reading: PoseReading, followed: OwnMotion, pairs: Indices, scale: float | None
 ) -> Judgement:
     """Judge the reading with poses `as_read`, over stretches (P, 2); scale: metres in the unit of length if known."""
     ends: Array = np.array([pose_at(as_read, int(stamp)) for stamp in followed.stamps_ns[pairs.ravel()]], np.float64)
@@ -309,9 +310,7 @@ def _angles(rotations: Array) -> Array:
     return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
 
-def stamps_on_clock(
-    rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: GivenTrajectory
-) -> Stamps:
+def stamps_on_clock(rows: WrittenPoses, recording: Recording, indices: Indices, other: GivenTrajectory) -> Stamps:
     """Return (N,) nanoseconds on the recording's clock, of stamps in seconds of that clock or since the first frame, or frame numbers.
 
     Rows without stamps belong to all frames, or to the selected ones: UsageError if their number matches neither. RecordingError for
@@ -357,7 +356,7 @@ def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: GivenTrajec
     )
 
 
-def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> OwnMotion:
+def _followed(recording: Recording, indices: Indices, *, whole: bool) -> OwnMotion:
     """Return fleetmap's odometry over all frames, or over some windows of them."""
     count = len(indices)
     spans = [(0, count)]
@@ -381,7 +380,7 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
 
 
 def _judged(
-    trajectory: Trajectory, followed: OwnMotion, pairs: NDArray[np.int64], recording: Recording, other: GivenTrajectory
+    trajectory: Trajectory, followed: OwnMotion, pairs: Indices, recording: Recording, other: GivenTrajectory
 ) -> tuple[Judgement, str]:
     """Return the poses in the named convention, and text on how well they fit.
 
@@ -415,7 +414,7 @@ def _judged(
     return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
 
 
-def _check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: GivenTrajectory) -> None:
+def _check_span(stamps_ns: Stamps, is_placed: Mask, recording: Recording, other: GivenTrajectory) -> None:
     """Raise UsageError if the frames (F,) with poses span less than half of the time of all."""
     times = stamps_ns[is_placed]
     if len(times) < 2 or np.ptp(times) < _LEAST_SPAN * np.ptp(stamps_ns):
@@ -426,7 +425,7 @@ def _check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Reco
         )
 
 
-def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: OwnMotion, other: GivenTrajectory) -> Array:
+def _bridged(at_frames: Array, is_placed: Mask, followed: OwnMotion, other: GivenTrajectory) -> Array:
     """Return the poses (F, 4, 4); missing ones follow odometry from the previous pose, adjusted to arrive at the next one."""
     out, own, seconds = at_frames.copy(), followed.frame_from_body, followed.stamps_ns * 1e-9
     numbers = np.flatnonzero(is_placed)

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
+from fleetmap.geometry import Indices
 from fleetmap.recordings import Recording, StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -72,7 +72,7 @@ class Drive(ABC):
 class RecordedDrive(Drive):
     """A recording, played at `speed` times its own rate; 0 for as fast as its frames are processed."""
 
-    def __init__(self, request: BuildRequest, recording: Recording, indices: NDArray[np.int64], speed: float) -> None:
+    def __init__(self, request: BuildRequest, recording: Recording, indices: Indices, speed: float) -> None:
         """recording, indices: what the request names, opened."""
         if not (np.isfinite(speed) and speed >= 0):
             raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")

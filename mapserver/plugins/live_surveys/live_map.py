@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
+from fleetmap.geometry import Array, Indices, Mask, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
 from fleetmap.messages import Cause, EstimateMessage, Placement, Status, covariance_entries
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.plugins.live_surveys import message
@@ -126,7 +125,7 @@ class LiveMap:
         """All candidates so far, and the loops accepted by the pose graph."""
         return Loops() if self._closer is None else self._closer.loops.without_outliers(self._loop_weights)
 
-    def parts(self) -> tuple[NDArray[np.int64], list[message.LivePart]]:
+    def parts(self) -> tuple[Indices, list[message.LivePart]]:
         """Return the parts that tracking, odometry and accepted loops connect: labels (K,) number them by time, -1 for keyframes that saw
         too little. Only the one with the most keyframes can be the map: parts still separate at the end are left out.
         """
@@ -148,7 +147,7 @@ class LiveMap:
         ]
         return labels, spans
 
-    def _estimate(self, labels: NDArray[np.int64], spans: list[message.LivePart]) -> EstimateMessage | None:
+    def _estimate(self, labels: Indices, spans: list[message.LivePart]) -> EstimateMessage | None:
         """Return the pose of the base at the newest keyframe in the growing map, relative to its first one, in the robots' form with
         odometry's continuous frame as `odom`; LOST while in another part. None for a single keyframe."""
         newest, placed, cov = len(self) - 1, None, None
@@ -286,7 +285,7 @@ class LiveMap:
             self._news[first + n] = self._news[first + n]._replace(motion_body=motions_body[n])
         self._keep_points(first, state, keep)
 
-    def _keep_points(self, first: int, state: SurveyState, keep: NDArray[np.bool_]) -> None:
+    def _keep_points(self, first: int, state: SurveyState, keep: Mask) -> None:
         """Keep landmarks on which enough keyframes of the window agree, in the axes of the keyframe that saw each first."""
         marks = state.landmarks
         reference = marks.obs_keyframe[np.unique(marks.obs_landmark, return_index=True)[1]]

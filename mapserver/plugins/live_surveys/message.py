@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import LinkError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.messages import EstimateMessage, Name, Text, Version
 from fleetmap.sensors.samples import ImuSamples
 
@@ -134,7 +134,7 @@ class LiveSurveyState(MapSketch, frozen=True, kw_only=True):
         return np.column_stack([places, quality / 255.0])
 
 
-def thinning(count: int, most: int) -> NDArray[np.int64]:
+def thinning(count: int, most: int) -> Indices:
     """Return at most `most` of `count` numbers, evenly, the last one included."""
     step = max(1, -(-count // most))
     return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)

@@ -9,11 +9,10 @@ from dataclasses import fields
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, Mask
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult
 from mapserver.survey.settings import BundleSettings
@@ -148,7 +147,7 @@ def _check(problem: BundleProblem) -> None:
         )
 
 
-def _free_unknowns(problem: BundleProblem) -> NDArray[np.bool_]:
+def _free_unknowns(problem: BundleProblem) -> Mask:
     """Return (K, 6 or 15): rotation, translation, velocity, gyro bias, accelerometer bias."""
     count, inertial = len(problem.map_from_body), problem.inertial
     moves = np.zeros((count, 6 if inertial is None else 15), np.bool_)

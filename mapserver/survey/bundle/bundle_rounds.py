@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from fleetmap.geometry import Mask
 from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
@@ -79,7 +80,7 @@ class _WindowIndex:
     relative: dict[int, list[RelativeTerm]]
 
 
-def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_], index: _WindowIndex) -> None:
+def _adjust_window(state: SurveyState, settings: SurveySettings, free: Mask, index: _WindowIndex) -> None:
     """Adjust one window with fixed earlier keyframes that see the same landmarks; landmarks seen only from elsewhere are unchanged.
 
     Writes to the arrays of `state`.
@@ -105,7 +106,7 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
     motion.motions[used] = part.motion.motions
 
 
-def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
+def bundle_problem(state: SurveyState, settings: SurveySettings, free: Mask | None) -> BundleProblem:
     """Return the bundle problem of a state; `free` (K,) are the keyframes that may move, all for None.
 
     Believed priors fix the map; without any the first keyframe does.
@@ -132,7 +133,7 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
 
 
 def inertial_edges(
-    state: SurveyState, settings: SurveySettings, held: NDArray[np.bool_] | None = None, first: int = 0
+    state: SurveyState, settings: SurveySettings, held: Mask | None = None, first: int = 0
 ) -> list[tuple[int, int, Preintegrated]]:
     """Return IMU edges between neighbouring keyframes, numbered from `first`; not between two fixed ones, nor over pauses."""
     motion, edges = state.motion, []

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import AnyArray, Array, se3_inverse
+from fleetmap.geometry import AnyArray, Array, Mask, se3_inverse
 from fleetmap.inertial import Preintegrated
 from mapserver.survey.rig import Rig
 from mapserver.survey.state import PriorTerm, RelativeTerm
@@ -40,7 +39,7 @@ class InertialTerms:
     motions: Array
     edges: list[tuple[int, int, Preintegrated]]
     priors: list[MotionPrior] = field(default_factory=list)
-    fixed: NDArray[np.bool_] | None = None
+    fixed: Mask | None = None
 
 
 class ImageRows(NamedTuple):
@@ -83,7 +82,7 @@ class BundleProblem:
 
     rig: Rig
     map_from_body: Array
-    fixed: NDArray[np.bool_]
+    fixed: Mask
     points_map: Array
     obs_keyframe: AnyArray
     obs_camera: AnyArray
@@ -102,7 +101,7 @@ class BundleProblem:
         """(K, V, 4, 4)."""
         return self.rig.map_from_cams(self.map_from_body)
 
-    def observed(self, keep: NDArray[np.bool_]) -> "BundleProblem":
+    def observed(self, keep: Mask) -> "BundleProblem":
         """Return the problem with the observations to keep (M,)."""
         return replace(self, **{name: getattr(self, name)[keep] for name in OBSERVED})
 

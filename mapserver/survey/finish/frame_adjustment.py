@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fleetmap.geometry import Array, interpolate_se3, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, interpolate_se3, se3_inverse
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.samples import Stamps
@@ -20,7 +20,7 @@ from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.pose_graph.odometry_factors import edge_covariance
 from mapserver.survey.settings import MIN_SEEN, BundleSettings, SurveySettings
-from mapserver.survey.state import Indices, Mask, OdometryPass, RelativeTerm, SurveyState
+from mapserver.survey.state import OdometryPass, RelativeTerm, SurveyState
 
 _BATCH = 8  # intervals
 _BESIDE = 1  # keyframes beyond the ends used for points; tracks slip, so distant ones would bend the result

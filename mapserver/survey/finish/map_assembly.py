@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.features.patch_align import halvings
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import PlacedFrames
@@ -36,7 +36,7 @@ class Culled:
 
 def assemble(
     state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
-) -> tuple[SurveyMap, NDArray[np.int64], Culled]:
+) -> tuple[SurveyMap, Indices, Culled]:
     """Return the SurveyMap of an adjusted survey, in the survey's own frame, its landmarks as rows of the state, and the removed ones."""
     images = RigImages.of(odometry.keyframes, state.map_from_body, state.rig).images
     state = state.by_image()
@@ -109,7 +109,7 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
 
 def cull(
     state: SurveyState, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Culled]:
+) -> tuple[Mask, Mask, Culled]:
     """Return the kept observations (M,) and keyframes (K,) of a single camera, and the removed ones; `state` is unchanged.
 
     sigmas_m (N,) of the landmarks.
@@ -139,9 +139,7 @@ def parallax_rad(state: SurveyState) -> Array:
     return angles
 
 
-def _duplicates(
-    marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
-) -> NDArray[np.bool_]:
+def _duplicates(marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings) -> Mask:
     """Return (N,) landmarks at the position of a better observed similar one, never seen beside it."""
     near = scipy.spatial.cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
     if not len(near):
@@ -153,9 +151,7 @@ def _duplicates(
     return core.duplicate_landmarks(near, *landmarks, settings.duplicate_distance)
 
 
-def redundant(
-    marks: Landmarks, octaves: NDArray[np.int8], lasting: NDArray[np.bool_], count: int, settings: CullSettings
-) -> NDArray[np.bool_]:
+def redundant(marks: Landmarks, octaves: NDArray[np.int8], lasting: Mask, count: int, settings: CullSettings) -> Mask:
     """Return (count,) keyframes whose landmarks are to a `redundant_share` seen by three others at the same or a finer scale.
 
     Removed one by one, those with the fewest landmarks first, so that mutually redundant ones are not all removed.

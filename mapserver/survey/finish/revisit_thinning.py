@@ -7,19 +7,19 @@ places are then known more accurately than the calibration.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
+from fleetmap.geometry import Indices, Mask
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem, bundle_rounds
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Indices, Landmarks, RigImages, SurveyState, image_numbers, of_features
+from mapserver.survey.state import Landmarks, RigImages, SurveyState, image_numbers, of_features
 from mapserver.survey.tracks.tracks import Tracks
 
 _LONGEST_GAP_S = 3.0  # longest IMU bridge across left-out keyframes
 
 
-def redundant_keyframes(tracks: Tracks, posed: RigImages, settings: SurveySettings) -> NDArray[np.bool_]:
+def redundant_keyframes(tracks: Tracks, posed: RigImages, settings: SurveySettings) -> Mask:
     """Return (K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends when no keyframe has seen a track for longer than the shortest loop. The last keyframes are removed first, so that
@@ -43,9 +43,7 @@ def redundant_keyframes(tracks: Tracks, posed: RigImages, settings: SurveySettin
     return redundant
 
 
-def _left_alone(
-    keyframes: NDArray[np.int64], track: NDArray[np.int64], redundant: NDArray[np.bool_], least: int
-) -> NDArray[np.bool_]:
+def _left_alone(keyframes: Indices, track: Indices, redundant: Mask, least: int) -> Mask:
     """Return (K,) keyframes next to redundant ones that share fewer tracks than `least` with the others."""
     used = ~redundant[keyframes]
     shared = used & (np.bincount(track[used], minlength=len(track))[track] > 1)
@@ -55,7 +53,7 @@ def _left_alone(
     return np.asarray(~redundant & beside & (np.bincount(keyframes[shared], minlength=len(redundant)) < least))
 
 
-def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> SurveyState:
+def without_redundant(state: SurveyState, redundant: Mask) -> SurveyState:
     """Return the state of all other keyframes; inertial factors do not span long gaps left by redundant ones."""
     if not redundant.any():
         return state
@@ -64,9 +62,7 @@ def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> Surve
     return replace(part, motion=replace(part.motion, goes_on=goes_on))
 
 
-def adjust_visits(
-    state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_], rounds: int
-) -> SurveyState:
+def adjust_visits(state: SurveyState, settings: SurveySettings, redundant: Mask, rounds: int) -> SurveyState:
     """Run the final adjustment without redundant keyframes (K,), and then localize those among its landmarks."""
     if not redundant.any():
         return bundle_rounds(state, settings, rounds=rounds, final=True)
@@ -84,7 +80,7 @@ def adjust_visits(
     return replace(state, landmarks=marks)
 
 
-def _seen_by(redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: Indices) -> Landmarks:
+def _seen_by(redundant: Mask, marks: Landmarks, adjusted: Landmarks, numbers: Indices) -> Landmarks:
     """Return redundant keyframes' observations of `adjusted`, the rest of `marks`; numbers (K, V): of the images of both."""
     stride, first = int(marks.obs_feature.max(initial=0)) + 1, adjusted.firsts
     codes = numbers[marks.obs_keyframe, marks.obs_camera] * stride + marks.obs_feature
@@ -97,7 +93,7 @@ def _seen_by(redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks
     return marks.taken(rows, adjusted.points_map, marks.obs_keyframe[rows], number[marks.obs_landmark[rows]])
 
 
-def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_]) -> SurveyState:
+def _localize(state: SurveyState, settings: SurveySettings, redundant: Mask) -> SurveyState:
     """Locate the redundant keyframes by their observations of fixed landmarks, and by the IMU; outliers are dropped."""
     for how in (settings.rough_bundle, settings.final_bundle):
         result = optimize(replace(bundle_problem(state, settings, redundant), points_held=True), how)

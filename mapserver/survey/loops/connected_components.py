@@ -9,10 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.settings import MIN_SEEN
@@ -47,12 +46,12 @@ class Component:
 class Components:
     """labels (K,): the component of each keyframe, -1 for stray ones, which belong to no component and are listed per run."""
 
-    labels: NDArray[np.int64]
+    labels: Indices
     components: list[Component]
     stray: list[Component]
 
     @property
-    def kept(self) -> NDArray[np.bool_]:
+    def kept(self) -> Mask:
         """(K,) keyframes that stay in the map: those of the component with the most keyframes that are not blind."""
         return np.asarray(self.labels == next(n for n, component in enumerate(self.components) if component.kept))
 
@@ -78,7 +77,7 @@ def find_components(state: SurveyState, odometry_sigmas_m: SigmaBetween, join_si
     for number, group in enumerate(real):
         labels[groups == group] = number
 
-    def component(members: NDArray[np.int64], kept: bool, reason: str) -> Component:
+    def component(members: Indices, kept: bool, reason: str) -> Component:
         start_s, end_s = (round(float(state.stamps_ns[k] - state.stamps_ns[0]) * 1e-9, 3) for k in members[[0, -1]])
         return Component(start_s, end_s, len(members), kept, reason)
 
@@ -102,13 +101,11 @@ def find_groups(state: SurveyState, sigmas_m: SigmaBetween, join_sigma_m: float)
     return KeyframeGroups([*pairs, *bridges(seeing, sigmas_m, join_sigma_m)], len(seeing))
 
 
-def _seeing(state: SurveyState) -> NDArray[np.bool_]:
+def _seeing(state: SurveyState) -> Mask:
     return np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns)) >= MIN_SEEN
 
 
-def bridges(
-    seeing: NDArray[np.bool_], sigmas_m: SigmaBetween, join_sigma_m: float, first: int = 0
-) -> list[tuple[int, int]]:
+def bridges(seeing: Mask, sigmas_m: SigmaBetween, join_sigma_m: float, first: int = 0) -> list[tuple[int, int]]:
     """Yield keyframes connected by odometry, from `first` on; seeing (K,): False for blind ones. See find_components."""
     seen = first + np.flatnonzero(seeing[first:])
     joins = [(int(a), int(b)) for a, b in pairwise(seen) if sigmas_m(int(a), int(b)) <= join_sigma_m]
@@ -143,7 +140,7 @@ def without_doubted(odometry: OdometryPass, doubted: Sequence[int]) -> OdometryP
 
 
 def only_kept(
-    state: SurveyState, odometry: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
+    state: SurveyState, odometry: OdometryPass, loops: Loops, kept: Mask
 ) -> tuple[SurveyState, OdometryPass, Loops]:
     """Return the survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
     if kept.all():
@@ -154,7 +151,7 @@ def only_kept(
     return state.of(kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
 
 
-def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def between_kept(frames: int, keyframe_frames: Indices, kept: Mask) -> Mask:
     """Return (F,) frames whose neighbouring keyframes, previous and next, are both kept."""
     before, after = np.searchsorted(keyframe_frames, [np.arange(1, frames + 1), np.arange(frames)])
     return np.asarray(kept[np.maximum(before - 1, 0)] & kept[np.minimum(after, len(kept) - 1)])

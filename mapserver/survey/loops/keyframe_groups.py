@@ -8,9 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import se3_inverse, so3_log
+from fleetmap.geometry import Indices, se3_inverse, so3_log
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
@@ -47,7 +46,7 @@ class KeyframeGroups:
             k = self._parents[k]
         return k
 
-    def labels(self) -> NDArray[np.int64]:
+    def labels(self) -> Indices:
         """Return (K,) the group of each keyframe, by its first keyframe."""
         return np.array([self.of(k) for k in range(len(self._parents))], np.int64)
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, transform_points
+from fleetmap.geometry import Array, Indices, Mask, se3_adjoint, se3_inverse, se3_log, transform_points
 from fleetmap.relocalization.map_view import image_cells
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
@@ -168,7 +167,7 @@ class LoopCloser:
                 self._decide(self._verify(i, alike, scores, self._gate(keyframe, alike, scores)))
         self._index.add(i, self._vectors[i])
 
-    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> list[int]:
+    def _gate(self, i: int, ids: Indices, scores: Array) -> list[int]:
         """Return numbers of at most `top` of the old images (C,) that may be seen from possible poses of keyframe i, the best first.
 
         With repeated aisles the most similar ones may all be in other aisles, so the gate goes down the list and records the refused
@@ -194,9 +193,7 @@ class LoopCloser:
                 self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
         return [*chosen[:top], *beyond]
 
-    def _verify(
-        self, i: int, ids: NDArray[np.int64], scores: Array, chosen: list[int]
-    ) -> list[tuple[PoseEdge, LoopRecord]]:
+    def _verify(self, i: int, ids: Indices, scores: Array, chosen: list[int]) -> list[tuple[PoseEdge, LoopRecord]]:
         """Return the chosen ones of old images (C,) that pass every single test, with their edges; record the others."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(ids[n]))], self._inputs) for n in chosen]
@@ -220,9 +217,7 @@ class LoopCloser:
                 self.loops.records.append(record)
         return verified
 
-    def _examined(
-        self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
-    ) -> tuple[LoopVerdict, str]:
+    def _examined(self, match: PairMatch | None, edge: PoseEdge | None, aliases: Indices) -> tuple[LoopVerdict, str]:
         """Return the verdict on one candidate alone, and its reason. aliases: old images as similar to the new one."""
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
@@ -304,12 +299,12 @@ class LoopCloser:
             self.learned.append(edge)
             self._map_from_body = self._marginals.map_from_body
 
-    def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _are_apart(self, j: int, others: Indices) -> Mask:
         """Return (M,) True for old keyframes at other places than j: they cannot be seen from there."""
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
         return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
-    def _unseen_alias(self, match: PairMatch, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
+    def _unseen_alias(self, match: PairMatch, edge: PoseEdge, aliases: Indices) -> float | None:
         """Return the possible position error if the site repeats as seen or configured; None if no alias is possible.
 
         Aliases are similar to the new image; those count that are at other places than the old one and match the new one too, as if
@@ -331,7 +326,7 @@ class LoopCloser:
                 return float(np.linalg.norm(way))
         return None
 
-    def _is_possible(self, edge: PoseEdge, steps: Array) -> NDArray[np.bool_]:
+    def _is_possible(self, edge: PoseEdge, steps: Array) -> Mask:
         """Return (M,) True where the new keyframe may be a step (M, 3) beside the place that the edge gives it."""
         return np.asarray(self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, Rings, inside_any, se3_inverse
+from fleetmap.geometry import Array, Mask, Rings, inside_any, se3_inverse
 from fleetmap.relocalization.map_view import COLUMNS, ROWS, Rows, image_cells
 from mapserver.survey.finish.map_assembly import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
@@ -15,7 +15,7 @@ from mapserver.survey.merge.merge import Change
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Landmarks, Mask, RigImages
+from mapserver.survey.state import Landmarks, RigImages
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Mask
 from fleetmap.relocalization.map_view import MapView, Rows, VisibleLandmarks, match_visible
 from fleetmap.relocalization.relocalizer import FrameFeatures
 from fleetmap.relocalization.settings import FixSettings
@@ -51,12 +51,12 @@ class Confirmation:
         return self.seen / max(self.cells, 1)
 
 
-def firm_landmarks(count: int, obs_landmark: NDArray[np.int32]) -> NDArray[np.bool_]:
+def firm_landmarks(count: int, obs_landmark: NDArray[np.int32]) -> Mask:
     """Return (N,) which of `count` landmarks are observed (M,) by enough keyframes of the map to be expected again."""
     return np.bincount(obs_landmark, minlength=count) >= _FIRM_OBSERVATIONS
 
 
-def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
+def due(expected: VisibleLandmarks, pixels: Array) -> Mask:
     """Return (V,) which visible landmarks a picture with features at pixels (F, 3) should show.
 
     Their octave is searched, and no corner beside them is much nearer.
@@ -72,9 +72,7 @@ def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
     return fits & ~hidden
 
 
-def look(
-    view: MapView, camera: StereoCamera, query: FrameFeatures, map_from_cam: Array
-) -> tuple[Rows, NDArray[np.bool_]]:
+def look(view: MapView, camera: StereoCamera, query: FrameFeatures, map_from_cam: Array) -> tuple[Rows, Mask]:
     """Return rows (V,) of the landmarks expected in a picture at this pose, and which of them it shows: the pose is not refined.
 
     A picture without features, in the dark, is no look.
@@ -93,9 +91,7 @@ def look(
     return expected.rows, (hit >= 0) & ~(off_px > _DISPARITY_PX)
 
 
-def confirmation(
-    points_map: Array, looks: Sequence[tuple[Rows, NDArray[np.bool_]]], firm: NDArray[np.bool_], error_rate: float
-) -> Confirmation:
+def confirmation(points_map: Array, looks: Sequence[tuple[Rows, Mask]], firm: Mask, error_rate: float) -> Confirmation:
     """Return the cells in which `firm` landmarks (N, 3) are expected by two or more looks, and those with enough of them seen.
 
     The bounds are those of Clopper and Pearson 1934 for the number of independent cells with the measured variance: blocks of cells

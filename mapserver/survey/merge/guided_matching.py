@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.patch_align import Patches, halvings, refine_matches
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, Mask, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import Rows
 from fleetmap.relocalization.relocalizer import FrameFeatures, Relocalizer
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
@@ -36,7 +35,7 @@ _NOTHING = Sighting(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3
 class Sightings:
     """The sightings by all images (I,) of a survey, joined: the image (P,) of each; located (I,): images that have one, if only empty."""
 
-    located: NDArray[np.bool_]
+    located: Mask
     image: Rows
     rows: Rows
     features: Rows
@@ -51,7 +50,7 @@ class Sightings:
         columns: list[Any] = [np.concatenate(part) for part in parts]
         return cls(np.array([seen is not None for seen in images]), image, *columns)
 
-    def only(self, keep: NDArray[np.bool_]) -> "Sightings":
+    def only(self, keep: Mask) -> "Sightings":
         """Return the chosen part (P,)."""
         return replace(self, **{name: getattr(self, name)[keep] for name in ("image", *Sighting._fields)})
 

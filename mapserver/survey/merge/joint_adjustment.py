@@ -11,9 +11,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, Mask, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
@@ -297,7 +296,7 @@ def _carried(state: SurveyState, map_from_body: Array) -> SurveyState:
     return replace(state.moved(map_from_body), landmarks=replace(marks, points_map=points_map))
 
 
-def free_observations(marks: Landmarks, sightings: Sightings) -> NDArray[np.bool_]:
+def free_observations(marks: Landmarks, sightings: Sightings) -> Mask:
     """Return (M,) observations of the survey's own landmarks, by image, whose feature shows no landmark of the map."""
     stride = 1 + max(int(marks.obs_feature.max(initial=0)), int(sightings.features.max(initial=0)))
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature

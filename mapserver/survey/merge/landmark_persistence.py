@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.pnp.pnp import GATE_SQUARED
 from fleetmap.relocalization.map_view import Rows, visible_landmarks
 from mapserver.survey.merge.base_map import BaseMap
@@ -52,13 +52,13 @@ def count_landmarks(
     return LandmarkCounts(expected, seen)
 
 
-def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:
+def missed_since(base: BaseMap, counts: LandmarkCounts) -> Indices:
     """Return (N,) how often each landmark was expected since it was last seen."""
     before = base.history.landmark_missed.astype(np.int64)
     return np.where(counts.seen > 0, 0, before + counts.expected - counts.seen)
 
 
-def faded(base: BaseMap, counts: LandmarkCounts, settings: SurveySettings) -> NDArray[np.bool_]:
+def faded(base: BaseMap, counts: LandmarkCounts, settings: SurveySettings) -> Mask:
     """Return (N,) landmarks that were missed more often than is likely if still present.
 
     The probability of detection is each landmark's own before the misses, shrunk towards the survey's if it was rarely
@@ -78,7 +78,7 @@ class Shift:
 
     rows: Rows
     points_map: Array
-    significant: NDArray[np.bool_]
+    significant: Mask
 
 
 def shifts(base: BaseMap, map_from_cam: Array, sightings: Sightings, settings: SurveySettings) -> Shift:

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.failure_definition import is_wrong
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.relocalization.map_view import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
@@ -137,7 +136,7 @@ class SessionKeyframes:
     camera: StereoCamera
     body_from_cams: Array
     map_from_survey: Array | None = None
-    pieces: NDArray[np.int64] | None = None
+    pieces: Indices | None = None
 
     @property
     def by_priors(self) -> Array | None:
@@ -149,7 +148,7 @@ class MembershipTest:
     """The test of one session in one map."""
 
     def __init__(
-        self, relocalizer: Relocalizer, firm: NDArray[np.bool_], session: SessionKeyframes, settings: SessionSettings
+        self, relocalizer: Relocalizer, firm: Mask, session: SessionKeyframes, settings: SessionSettings
     ) -> None:
         """firm (N,): landmarks of the relocalizer's view that are expected to be seen again."""
         self._relocalizer, self._firm, self._session, self._settings = relocalizer, firm, session, settings
@@ -215,7 +214,7 @@ class MembershipTest:
             )
         return None
 
-    def _beside_the_map(self, map_from_body: Array) -> NDArray[np.bool_]:
+    def _beside_the_map(self, map_from_body: Array) -> Mask:
         """Return which images (K, V) of keyframes at map_from_body (K, 4, 4) are near a place of the map, with a similar heading."""
         places, looking = self._relocalizer.view.map_from_cam, map_from_body[:, None] @ self._session.body_from_cams
         beside = [places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any() for at in looking.reshape(-1, 4, 4)]

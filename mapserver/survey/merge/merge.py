@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import AnyArray, Array, se3_inverse
+from fleetmap.geometry import AnyArray, Array, Mask, se3_inverse
 from fleetmap.relocalization.map_view import Rows
 from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_sigmas_m
 from mapserver.survey.merge.base_map import BaseMap, with_baseline
@@ -26,7 +26,7 @@ class Change:
     and descriptor it takes, -1 for a new one, which is added_own of the new survey's. map_from_cam: of the new survey's keyframes.
     """
 
-    keep: NDArray[np.bool_]
+    keep: Mask
     points_map: Array
     map_from_body: Array
     added: Landmarks
@@ -41,7 +41,7 @@ def merged(
     counts: LandmarkCounts,
     keyframes: list[Keyframe],
     min_place_landmarks: int,
-    no_place: NDArray[np.bool_] | bool = False,
+    no_place: Mask | bool = False,
 ) -> SurveyMap:
     """Return the next version's map, with the old trajectory. Keyframes without landmarks are removed; new ones are added if they see
     added landmarks. no_place: those of the new survey's keyframes (K,) that are no places for robots.
@@ -92,7 +92,7 @@ def merged(
     )
 
 
-def kept(survey_map: SurveyMap, keep: NDArray[np.bool_]) -> SurveyMap:
+def kept(survey_map: SurveyMap, keep: Mask) -> SurveyMap:
     """Return the map with some of its landmarks (N,), without the keyframes that saw no others; all else is bit-identical."""
     history, keep_obs = history_of(survey_map), keep[survey_map.obs_landmark]
     used = np.bincount(survey_map.obs_keyframe[keep_obs], minlength=len(survey_map.map_from_body)) > 0

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Mask, se3_inverse
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
@@ -30,7 +30,7 @@ from mapserver.survey.merge.merge import merged
 from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Mask, RigImages
+from mapserver.survey.state import RigImages
 from mapserver.survey.survey_map import SurveyMap
 
 

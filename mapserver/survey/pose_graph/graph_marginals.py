@@ -10,10 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from fleetmap.features.matching import Indices
-from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, so3_left_jacobian
+from fleetmap.geometry import Array, Indices, Mask, se3_adjoint, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges, optimize_pose_graph
-from mapserver.survey.state import Mask
 
 CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a position
 CHI2_6_0999 = 22.458  # with 6: a pose

@@ -6,9 +6,8 @@ from itertools import chain
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, Indices, rotation_angle_rad, se3_inverse
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import PairSettings
 from mapserver.survey.state import RigImages
@@ -103,7 +102,7 @@ class NearPlaces:
         numbers = [np.flatnonzero(levels == level) for level in np.unique(levels)]
         self._trees = [(own, scipy.spatial.cKDTree(positions_m[own]), float(reach_m[own].max())) for own in numbers]
 
-    def before(self, j: int, until: int) -> NDArray[np.int64]:
+    def before(self, j: int, until: int) -> Indices:
         """Return ascending numbers below `until` of all that may reach j or be reached from it."""
         place_m, reach_m = self._positions_m[j], float(self._reach_m[j])
         near = [own[tree.query_ball_point(place_m, max(reach_m, most_m))] for own, tree, most_m in self._trees]

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.features.matching import match_mutual
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, Indices, se3_inverse, transform_points
 from fleetmap.odometry.mono.two_view import triangulate_pair
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.rig import CameraKind, Rig
@@ -21,7 +20,7 @@ class MonoDepths:
     def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
         self._camera, self._settings = camera, settings
         self._keyframes: list[Keyframe] = []
-        self._matches: dict[tuple[int, int], NDArray[np.int64]] = {}
+        self._matches: dict[tuple[int, int], Indices] = {}
         self.grow(keyframes)
 
     def grow(self, keyframes: Sequence[Keyframe]) -> None:
@@ -54,7 +53,7 @@ class MonoDepths:
             for k in range(first, len(self._keyframes))
         ]
 
-    def _measure(self, i: int, j: int, match: NDArray[np.int64], j_from_i: Array) -> tuple[Array, Array]:
+    def _measure(self, i: int, j: int, match: Indices, j_from_i: Array) -> tuple[Array, Array]:
         """Return for both keyframes rows (P, 3) of feature, inverse depth and its sigma."""
         a, b, s = self._keyframes[i].features, self._keyframes[j].features, self._settings.monocular
         pixels_a, pixels_b = a.pixels[match[:, 0]], b.pixels[match[:, 1]]

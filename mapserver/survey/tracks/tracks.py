@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.patch_align import Patches, refine_matches
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, Indices, Mask, se3_inverse, transform_points
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Indices, Keyframe, Landmarks, RigImages, of_features
+from mapserver.survey.state import Keyframe, Landmarks, RigImages, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 
 _SAME_WARP = 0.01  # isotropic change of a patch's shape that moves its rim by less than 0.05 px
@@ -64,7 +63,7 @@ def build_landmarks(
     tracks: Tracks,
     settings: SurveySettings,
     executor: Executor = SERIAL,
-    redundant: NDArray[np.bool_] | None = None,
+    redundant: Mask | None = None,
 ) -> Landmarks:
     """Return landmarks of tracks with a stereo point, each observation's coordinate refined against the reference patch.
 
@@ -106,9 +105,7 @@ def refine_observations(
     return replace(marks, obs_pixels=pixels, obs_sigma_px=sigmas)
 
 
-def _warps(
-    seen: tuple[NDArray[np.int64], NDArray[np.int64]], points_map: Array, map_from_cam: Array
-) -> tuple[Array, Array]:
+def _warps(seen: tuple[Indices, Indices], points_map: Array, map_from_cam: Array) -> tuple[Array, Array]:
     """Return rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of the ratio of their distances.
 
     seen: the image (M,) of each observation and that of its reference. points_map (M, 3) of their landmarks.
@@ -120,15 +117,13 @@ def _warps(
     return np.asarray(cam_from_map[own, :3, :3] @ map_from_cam[reference, :3, :3]), np.asarray(scale)
 
 
-def _reference_rows(table: NDArray[np.int64]) -> Indices:
+def _reference_rows(table: Indices) -> Indices:
     """Return (M,) the row of each observation's reference, the first one of its landmark."""
     is_first = np.diff(table[:, 1], prepend=-1) != 0
     return np.maximum.accumulate(np.where(is_first, np.arange(len(table)), 0))
 
 
-def _tracks_from_reference(
-    images: list[Keyframe], tracks: Tracks, is_redundant: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], Array]:
+def _tracks_from_reference(images: list[Keyframe], tracks: Tracks, is_redundant: Mask) -> tuple[Indices, Array]:
     """Return (M, 3) image, landmark, feature of the tracks with depth, each one's reference first; its points_cam (N, 3).
 
     The reference defines the landmark's patch: with depth, not redundant (M,), finest octave, nearest.
@@ -156,7 +151,7 @@ def _tracks_from_reference(
 
 
 def _observe(
-    posed: RigImages, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
+    posed: RigImages, table: Indices, points_map: Array, settings: SurveySettings, executor: Executor
 ) -> tuple[Array, Array]:
     """Return pixels (M, 3) and sigmas (M, 2) of observations (image, landmark, feature), references first in each landmark."""
     images, map_from_cam, reference_rows = posed.images, posed.map_from_cam, _reference_rows(table)
@@ -183,8 +178,8 @@ def _observe(
 class _ObservationBatch:
     """Observations (M, 3) in some images, their references (M, 3), their landmarks (M, 3), and the required images with map_from_cam."""
 
-    table: NDArray[np.int64]
-    references: NDArray[np.int64]
+    table: Indices
+    references: Indices
     points_map: Array
     images: dict[int, tuple[Keyframe, Array]]
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import MapFormatError, check_format
 from fleetmap.features.matching import Descriptors, Packed, packed
+from fleetmap.geometry import Indices, Mask
 
 WordIds = NDArray[np.int32]
 VOCABULARY_FORMAT = 1
@@ -148,7 +149,7 @@ class PlaceIndex:
         return self._count
 
     @property
-    def place_ids(self) -> NDArray[np.int64]:
+    def place_ids(self) -> Indices:
         """(P,) ids in the order of insertion, which is the order of a candidates mask."""
         return self._place_ids[: self._count]
 
@@ -163,8 +164,8 @@ class PlaceIndex:
         self._file.add(vector.word_ids, vector.weights)
 
     def query(
-        self, vector: BowVector, candidates_mask: NDArray[np.bool_] | None = None, top_k: int = 10
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        self, vector: BowVector, candidates_mask: Mask | None = None, top_k: int = 10
+    ) -> tuple[Indices, NDArray[np.float64]]:
         """Return ids and scores of the up to `top_k` most similar places, best first; places without a common word are left out.
 
         candidates_mask (P,), in the order of `place_ids`, marks the places that may be returned. The score is 1 - |a - b|_1 / 2, in

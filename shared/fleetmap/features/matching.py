@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.orb import Features
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 
 Descriptors = NDArray[np.uint8]
 Packed = NDArray[np.uint64]
-Indices = NDArray[np.int64]
 Distances = NDArray[np.int32]
 FAR = 257  # more than any two descriptors can differ by
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.features.settings import AlignSettings
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetmap.sensors.samples import Image
 
 Pyramid = tuple[Image, Image, Image]
@@ -28,10 +28,10 @@ class Patches(NamedTuple):
     pixels: Array
     octaves: NDArray[np.int8]
     angles_deg: NDArray[np.float32]
-    chosen: NDArray[np.int64]
+    chosen: Indices
 
     @classmethod
-    def of(cls, pyramid: Pyramid, features: Features, chosen: NDArray[np.int64]) -> "Patches":
+    def of(cls, pyramid: Pyramid, features: Features, chosen: Indices) -> "Patches":
         """Return the chosen features (N,) of an image."""
         pixels = np.ascontiguousarray(features.pixels, np.float64)
         octaves = np.ascontiguousarray(features.octaves, np.int8)
@@ -57,6 +57,6 @@ def refine_matches(
     return core.align_features(reference, current, points, motion, *limits)
 
 
-def halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:
+def halvings(octaves: NDArray[np.int8]) -> Indices:
     """(N,) the level of `half_pyramid` nearest to the scale of each octave."""
     return np.asarray(np.clip(np.rint(octaves * np.log2(SCALE_FACTOR)), 0, 2), np.int64)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import MapFormatError
-from fleetmap.geometry import Array, quat_wxyz_from_rotation
+from fleetmap.geometry import Array, Indices, quat_wxyz_from_rotation
 from fleetmap.mapformat.container import pack, unpack
 
 Ids = NDArray[np.uint32]
@@ -58,7 +58,7 @@ class Tile:
         return np.array([self.tile_x * self.size_m, self.tile_y * self.size_m])
 
 
-def off_tile_m(cells: NDArray[np.int64], size_m: float, positions_map_m: Array) -> Array:
+def off_tile_m(cells: Indices, size_m: float, positions_map_m: Array) -> Array:
     """Return the horizontal distances (...,) of positions (..., 2 or 3) from tiles of size_m at cells (..., 2), 0 inside."""
     off = cells * size_m - positions_map_m[..., :2]
     return np.asarray(np.linalg.norm(np.maximum(np.maximum(off, -off - size_m), 0.0), axis=-1))

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.sensors.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight (Geman-McClure), in sigmas
@@ -32,7 +31,7 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.points_source)
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
+    def take(self, rows: Mask | Indices) -> "Correspondences":
         """Select a subset."""
         return Correspondences(self.camera, self.points_source[rows], self.pixels[rows], self.sigmas_px[rows])
 
@@ -47,7 +46,7 @@ class PnpResult:
 
     cam_from_source: Array
     information: Array
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     squared: Array
 
     @cached_property

@@ -8,9 +8,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
+from fleetmap.geometry import Indices, Mask
 from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
 from fleetmap.recordings.ordering import (
@@ -39,7 +39,7 @@ class ImageSeries:
     def __len__(self) -> int:
         return len(self.sources)
 
-    def take(self, indices: NDArray[np.int64]) -> "ImageSeries":
+    def take(self, indices: Indices) -> "ImageSeries":
         """Images at `indices` (K,)."""
         return ImageSeries(self.stamps_ns[indices], tuple(self.sources[int(i)] for i in indices))
 
@@ -91,7 +91,7 @@ class ViewImages:
     """
 
     images: Mapping[str, ImageSeries]
-    rows: NDArray[np.int64]
+    rows: Indices
 
     def read(self, reader: ImageReader, index: int, bits: int) -> StoredFrame | None:
         """The images at a frame; bits: used ones of 16-bit images."""
@@ -104,7 +104,7 @@ class ViewImages:
             read |= {field: replace(image, bits=bits) for field, image in read.items() if field != "depth"}
         return StoredFrame(int(self.images["left"].stamps_ns[row]), **read)
 
-    def part(self, indices: NDArray[np.int64]) -> "ViewImages":
+    def part(self, indices: Indices) -> "ViewImages":
         """The images at the frames at indices (K,), without the others: another process gets no more than it reads."""
         used, rows = np.unique(self.rows[indices], return_inverse=True)
         kept = used[used >= 0]
@@ -137,7 +137,7 @@ class SeriesFrames:
     def frame(self, index: int) -> CameraFrame:
         return decode_frame(self.stored(index))
 
-    def part(self, indices: NDArray[np.int64]) -> "SeriesFrames":
+    def part(self, indices: Indices) -> "SeriesFrames":
         return replace(self, reader=self.reader.apart(), views=tuple(view.part(indices) for view in self.views))
 
     def of_view(self, number: int) -> "SeriesFrames":
@@ -239,7 +239,7 @@ def _note_silence(name: str, stamps_ns: Stamps, every_ns: Stamps, log: ReadLog) 
         log.note("camera silent", f"{name} has no images from {when}, while others have; its view is missing there")
 
 
-def _silent(stamps_ns: Stamps, every_ns: Stamps) -> NDArray[np.bool_]:
+def _silent(stamps_ns: Stamps, every_ns: Stamps) -> Mask:
     """(N,) mask of the moments (N,) that have no stamp within half a second, or within the usual period if that is longer."""
     if not len(stamps_ns):
         return np.ones(len(every_ns), np.bool_)

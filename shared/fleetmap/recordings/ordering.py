@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fleetmap.encoding import MOST
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
+from fleetmap.geometry import Array, Indices, Mask, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Trajectory
 
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken simultaneously
@@ -51,7 +51,7 @@ class ReadLog:
         return "; ".join(f"{issue.what}: {issue.detail}" for issue in self.issues)
 
 
-def as_logged(stamps: ArrayLike, log_times: ArrayLike, what: str, log: ReadLog) -> tuple[Stamps, NDArray[np.int64]]:
+def as_logged(stamps: ArrayLike, log_times: ArrayLike, what: str, log: ReadLog) -> tuple[Stamps, Indices]:
     """Stamps (N,), and indices (N,) of the order in which they were logged: files hold chunks, parts and channels one after the other.
 
     The order of the file is kept where more stamps increase in it: the recorder's clock may have been set. Unset stamps (0) are replaced by
@@ -68,7 +68,7 @@ def as_logged(stamps: ArrayLike, log_times: ArrayLike, what: str, log: ReadLog) 
     return stamps_ns, max(orders, key=lambda order: int(_longest_increasing(stamps_ns[order]).sum()))
 
 
-def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:
+def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> Mask:
     """(N,) mask of the images with the most frequent size (width, height) or an unknown one; the others are noted in `log`."""
     counts = Counter(size for size in sizes_px if size).most_common()
     if len(counts) < 2:
@@ -79,7 +79,7 @@ def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadL
     return np.array([size in (None, usual) for size in sizes_px], np.bool_)
 
 
-def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
+def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> Mask:
     """(N,) mask of a longest strictly increasing subsequence without isolated stamps far from all others; omissions are noted in `log`.
 
     Stamps are never sorted: stamps of values that arrive out of order cannot be trusted. One stamp far in the
@@ -112,7 +112,7 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
     return kept
 
 
-def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
+def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> Mask:
     """(N,) mask of the few isolated increasing stamps, a pause away from all others; noted in `log`."""
     strays, steps = np.zeros(len(stamps_ns), np.bool_), np.diff(stamps_ns)
     if len(steps) == 0:
@@ -133,7 +133,7 @@ def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
     return strays
 
 
-def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
+def _longest_increasing(stamps_ns: Stamps) -> Mask:
     """(N,) a longest strictly increasing subsequence. Source: patience sorting."""
     if (np.diff(stamps_ns) > 0).all():
         return np.ones(len(stamps_ns), np.bool_)
@@ -236,7 +236,7 @@ def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLo
     return Trajectory(stamps_ns[rows], np.stack(frame_from_body))
 
 
-def pair_stamps(left_ns: Stamps, right_ns: Stamps, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pair_stamps(left_ns: Stamps, right_ns: Stamps, tolerance_ns: int) -> tuple[Indices, Indices]:
     """Indices (P,), (P,) of increasing left and right stamps that are each other's nearest, and within the tolerance."""
     if len(left_ns) == 0 or len(right_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -246,7 +246,7 @@ def pair_stamps(left_ns: Stamps, right_ns: Stamps, tolerance_ns: int) -> tuple[N
     return chosen, right_of_left[chosen]
 
 
-def nearest(sorted_ns: Stamps, wanted_ns: Stamps) -> NDArray[np.int64]:
+def nearest(sorted_ns: Stamps, wanted_ns: Stamps) -> Indices:
     """(N,) index of the stamp in sorted_ns (M,), M > 0, that is nearest to each of wanted_ns (N,)."""
     after = np.clip(np.searchsorted(sorted_ns, wanted_ns), 0, len(sorted_ns) - 1)
     before = np.maximum(after - 1, 0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
+from fleetmap.geometry import Indices
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import StoredFrame, file_kind
 from fleetmap.sensors.calibration import RigCalibration
@@ -56,7 +57,7 @@ class FrameSource(Protocol):
     def frame(self, index: int) -> CameraFrame:
         """Frame `index`, decoded; RecordingError naming an image that cannot be decoded."""
 
-    def part(self, indices: NDArray[np.int64]) -> "FrameSource":
+    def part(self, indices: Indices) -> "FrameSource":
         """The frames at indices (K,), renumbered, read and closed independently of this source, also in other threads and processes."""
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
@@ -86,7 +87,7 @@ class WrappedFrames:
 class _SomeFrames(WrappedFrames):
     """The frames of a source at indices (K,), renumbered."""
 
-    indices: NDArray[np.int64]
+    indices: Indices
 
     def stored(self, index: int) -> StoredFrame:
         return self.source.stored(int(self.indices[index]))
@@ -94,7 +95,7 @@ class _SomeFrames(WrappedFrames):
     def frame(self, index: int) -> CameraFrame:
         return self.source.frame(int(self.indices[index]))
 
-    def part(self, indices: NDArray[np.int64]) -> FrameSource:
+    def part(self, indices: Indices) -> FrameSource:
         return self.source.part(self.indices[indices])
 
 
@@ -148,7 +149,7 @@ class Recording:
                 )
         return frame
 
-    def readable(self, indices: NDArray[np.int64]) -> tuple["Recording", NDArray[np.int64]]:
+    def readable(self, indices: Indices) -> tuple["Recording", Indices]:
         """Return the recording without those frames at indices (K,) whose images are damaged, and the new indices of the others.
 
         They are noted in its issues. Only JPEG images are decoded for it: the checksums of PNG files were checked when the recording
@@ -187,7 +188,7 @@ class Recording:
         self._check_index(index)
         return self.frames.stored(index)
 
-    def part(self, indices: NDArray[np.int64]) -> "Recording":
+    def part(self, indices: Indices) -> "Recording":
         """The recording with only the frames at indices (K,), renumbered; see `FrameSource.part`."""
         return replace(self, frame_stamps_ns=self.frame_stamps_ns[indices], frames=self.frames.part(indices))
 
@@ -268,7 +269,7 @@ class FrameSelection:
             raise UsageError(f"--frames {text!r}: the step {step} must be 1 or more; {backwards}")
         return cls(start, stop, step or 1)
 
-    def apply(self, recording: Recording) -> NDArray[np.int64]:
+    def apply(self, recording: Recording) -> Indices:
         """The selected frame indices (K,), increasing; UsageError if none is left."""
         indices = np.arange(len(recording), dtype=np.int64)[self.start : self.stop : self.step]
         if len(indices) == 0:

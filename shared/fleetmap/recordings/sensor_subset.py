@@ -3,10 +3,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fleetmap.errors import RecordingError, chosen
+from fleetmap.geometry import Indices
 from fleetmap.recordings import OpenOptions, Recording, open_recording
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import RigCalibration
@@ -75,5 +73,5 @@ class _Reduced(WrappedFrames):
         frame = self.source.frame(index)
         return CameraFrame(frame.stamp_ns, frame.left) if self.single else frame
 
-    def part(self, indices: NDArray[np.int64]) -> "_Reduced":
+    def part(self, indices: Indices) -> "_Reduced":
         return replace(self, source=self.source.part(indices))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.matching import packed
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 
 _MAX_FEATURES, _MAX_PAIRS = 96, 400_000
 _CELL_M = 0.5
@@ -47,8 +47,8 @@ class AliasCandidate:
 
     map_from_cam: Array
     alias_ratio: float
-    features: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
+    features: Indices
+    landmarks: Indices
 
 
 def find_aliases(
@@ -117,7 +117,7 @@ class _Votes:
                 break
         return found
 
-    def candidate(self, quarter: int, centre: Array, ratio: float, used: NDArray[np.int64]) -> AliasCandidate:
+    def candidate(self, quarter: int, centre: Array, ratio: float, used: Indices) -> AliasCandidate:
         """The camera at a peak, in the median of its votes; used (F,): numbers of the features among all recognized ones."""
         pairs = self._others
         cameras = self._landmarks_map[pairs[:, 1], :2] - self._offsets[quarter][pairs[:, 0]]

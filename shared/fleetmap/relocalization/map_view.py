@@ -17,7 +17,7 @@ from fleetmap import core
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import Descriptors, Projected, match_by_projection, packed
 from fleetmap.features.orb import SCALE_FACTOR, Features
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, Indices, Mask
 from fleetmap.mapformat.tile import Tile
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
@@ -95,9 +95,7 @@ def cones_of_tiles(tiles: Sequence[Tile]) -> ViewingCones:
     )
 
 
-def places_around(
-    places_map_from_cam: Array, map_from_cam: Array, radius_m: float, min_cosine: float
-) -> NDArray[np.bool_]:
+def places_around(places_map_from_cam: Array, map_from_cam: Array, radius_m: float, min_cosine: float) -> Mask:
     """(K,) True for places (K, 4, 4) within a radius of a camera and of similar viewing direction, by the cosine between the axes."""
     apart_m = np.linalg.norm(places_map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
     axes_map, axis_map = places_map_from_cam[:, :3, 2], map_from_cam[:3, 2]
@@ -138,7 +136,7 @@ class CovisibleLandmarks:
     ids: NDArray[np.uint32]
     points_map: Array
     descriptors: NDArray[np.uint8]
-    is_found: NDArray[np.bool_]
+    is_found: Mask
 
 
 class LookAlikes(NamedTuple):
@@ -226,7 +224,7 @@ class MapView:
         return np.flatnonzero(np.bincount(self._shown[near[self._place_of_shown]]))  # `unique` hashes: ten times slower
 
 
-def most_similar(similarities: Array, allowed: NDArray[np.bool_] | None, top: int) -> Rows:
+def most_similar(similarities: Array, allowed: Mask | None, top: int) -> Rows:
     """Return at most `top` of the allowed places (K,) with any similarity, best first."""
     shares = similarities if allowed is None else np.where(allowed, similarities, 0.0)
     best = np.argsort(-shares, kind="stable")[:top]
@@ -256,7 +254,7 @@ class DescriptorIndex:
         self._held = bits[self._order]
         self._starts = np.searchsorted(cells[self._order], np.arange(len(self._centres) + 1))
 
-    def near(self, descriptors: Descriptors, max_bits: int) -> NDArray[np.bool_]:
+    def near(self, descriptors: Descriptors, max_bits: int) -> Mask:
         """(M,) True for indexed descriptors within max_bits of any query (N, 32)."""
         found = np.zeros(len(self._held), bool)
         is_near = core.near_descriptors(packed(descriptors), self._centres, _CELLS, self._held, self._starts, max_bits)
@@ -264,7 +262,7 @@ class DescriptorIndex:
         return found
 
 
-def _nodes_at(vocabulary: Vocabulary, level: int) -> NDArray[np.int64]:
+def _nodes_at(vocabulary: Vocabulary, level: int) -> Indices:
     """The nodes of a level of the tree and the leaves above it; the root if it has no children."""
     nodes, leaves = np.zeros(1, np.int64), np.zeros(0, np.int64)
     for _ in range(level):

@@ -10,7 +10,7 @@ from fleetmap.features import orb, stereo
 from fleetmap.features.extraction import extract_in_slices
 from fleetmap.features.matching import Packed, match_mutual, packed
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, length, se3_inverse
+from fleetmap.geometry import Array, Indices, Mask, length, se3_inverse
 from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView, Rows, most_similar, places_around
@@ -30,7 +30,7 @@ class FrameFeatures:
     features: orb.Features
     pixels: Array
     frame: RectifiedFrame | None = None
-    is_tried: NDArray[np.bool_] | None = None
+    is_tried: Mask | None = None
 
     @classmethod
     def of(
@@ -48,14 +48,14 @@ class FrameFeatures:
         pixels, left = np.ascontiguousarray(self.pixels), np.ascontiguousarray(features.pixels, np.float64)
         return pixels, left, np.ascontiguousarray(features.octaves), packed(features.descriptors)
 
-    def unmeasured(self) -> tuple[Image, Image, Array, NDArray[np.bool_]] | None:
+    def unmeasured(self) -> tuple[Image, Image, Array, Mask] | None:
         """The pair of images, and arrays that the core fills when it measures depth."""
         if self.frame is None or self.is_tried is None:
             return None
         assert self.frame.right is not None
         return self.frame.left, self.frame.right, self.pixels, self.is_tried
 
-    def measured(self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings) -> Array:
+    def measured(self, rows: Indices, camera: StereoCamera, settings: StereoSettings) -> Array:
         """Pixels (P, 3) of some features; measures depth not tried before."""
         if self.frame is not None and self.is_tried is not None:
             at = rows[~self.is_tried[rows]]
@@ -107,7 +107,7 @@ class Fix:
     alias_ratio: float = 1.0
     expected: int = 0
     seen: int = 0
-    matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
+    matches: Indices | None = field(default=None, repr=False, compare=False)
     covisible: CovisibleLandmarks | None = field(default=None, repr=False, compare=False)
     matched: Correspondences | None = field(default=None, repr=False, compare=False)
     floor: str = ""
@@ -160,7 +160,7 @@ class Relocalizer:
     def anywhere(
         self,
         query: FrameFeatures,
-        allowed: NDArray[np.bool_] | None = None,
+        allowed: Mask | None = None,
         map_from_cam_rotation: Array | None = None,
         found: Sequence[Fix] = (),
         failed: list[Array] | None = None,
@@ -253,7 +253,7 @@ class Relocalizer:
             matched=Correspondences(self._camera, *matched),
         )
 
-    def _ranked(self, query: FrameFeatures, allowed: NDArray[np.bool_] | None, failed: list[Array]) -> Rows:
+    def _ranked(self, query: FrameFeatures, allowed: Mask | None, failed: list[Array]) -> Rows:
         """Places to try, the most similar first; without failed ones and neighbourhoods of several failures, unless none else is left."""
         top, similarities = _RANKED * self._settings.fix.top_places, self.similarities(query)
         if not failed:
@@ -359,7 +359,7 @@ class Relocalizer:
             rotation_sigma_rad=sigma_rad,
         )
 
-    def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> Correspondences:
+    def _matched(self, query: FrameFeatures, features: Indices, rows: Rows) -> Correspondences:
         """Points (P, 3) of landmarks and their matching features, for an unknown camera pose."""
         settings = self._settings
         measured = query.measured(features, self._camera, settings.stereo)
@@ -391,7 +391,7 @@ def _sigmas(cov_rot_trans: Array) -> tuple[float, float]:
     return float(rotation), float(position)
 
 
-def _at_place(places_map_from_cam: Array, map_from_cam: Array) -> NDArray[np.bool_]:
+def _at_place(places_map_from_cam: Array, map_from_cam: Array) -> Mask:
     """Return (K,) which places (K, 4, 4) have mostly the same neighbourhood as a camera."""
     return places_around(places_map_from_cam, map_from_cam, SAME_PLACE_M, _SAME_PLACE_COSINE)
 

@@ -4,10 +4,9 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Mask, se3_inverse
 from fleetmap.sensors.cameras import CAMERA_MODELS
 
 _SUB_PX = 4  # bits of a pixel's fraction
@@ -129,7 +128,7 @@ class RigCalibration:
         return NO_BASE if "base_from_body" in self.assumed else ""
 
 
-def hidden_pixels(mask: tuple[Polygon, ...], size_px: tuple[int, int]) -> NDArray[np.bool_]:
+def hidden_pixels(mask: tuple[Polygon, ...], size_px: tuple[int, int]) -> Mask:
     """(H, W) True inside a mask's polygons or on their edges, for an image of a width and a height."""
     outlines = [np.rint(np.array(polygon) * 2**_SUB_PX).astype(np.int32) for polygon in mask]
     return np.asarray(cv2.fillPoly(np.zeros(size_px[::-1], np.uint8), outlines, (1,), shift=_SUB_PX), bool)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, midpoints, se3_inverse
+from fleetmap.geometry import Array, Mask, midpoints, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
 from fleetmap.sensors.cameras import LENSES
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
@@ -121,10 +121,10 @@ def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | 
     return LensFit(float(given.mean()), float(best.mean()), words)
 
 
-def _followed(image: Image, other: Image, corners: Points) -> tuple[Array, NDArray[np.bool_]]:
+def _followed(image: Image, other: Image, corners: Points) -> tuple[Array, Mask]:
     """Pixels (N, 2) in the other image, and a mask of those that pass the backward check."""
 
-    def follow(first: Image, second: Image, points: Points) -> tuple[Points, NDArray[np.bool_]]:
+    def follow(first: Image, second: Image, points: Points) -> tuple[Points, Mask]:
         guess = np.empty(0, np.float32)
         found, status, _ = cv2.calcOpticalFlowPyrLK(first, second, points, guess, winSize=(15, 15), maxLevel=4)
         return np.asarray(found, np.float32), np.asarray(status.ravel() == 1)

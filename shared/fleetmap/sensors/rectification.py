@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, Mask, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import (
     LEAST_BASELINE_M,
     SIDEWAYS,
@@ -281,7 +281,7 @@ def _remap_tables(
     distortion: tuple[float, ...],
     cam_from_rect: tuple[float, ...],
     mask: tuple[Polygon, ...],
-) -> tuple[tuple[core.Remap, NDArray[np.int32]] | None, NDArray[np.bool_] | None]:
+) -> tuple[tuple[core.Remap, NDArray[np.int32]] | None, Mask | None]:
     """Fixed-point look-up tables, and (H, W) the index of the nearest pixel, -1 outside the image; None if the image is already rectified
     (as KITTI's). And the rectified mask."""
     v, u = np.indices((rectified.height_px, rectified.width_px), np.float64)

@@ -9,10 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fleetmap.errors import RecordingError, UsageError, chosen
+from fleetmap.geometry import Indices
 from fleetmap.hooks import plugins
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -30,7 +28,7 @@ class ReplaySource:
     """
 
     recording: Recording
-    indices: NDArray[np.int64]
+    indices: Indices
     reverse: bool
 
     @classmethod

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import Mask
 from fleetmap.plugins.other_recorders.calibration import (
     calibration_of_messages,
     camera_poses,
@@ -205,7 +205,7 @@ class _Lens(NamedTuple):
     """The lens of most of a camera's images, None if no CameraInfo describes one; and (N,) the images that were taken with it."""
 
     info: CameraInfo | None
-    usable: NDArray[np.bool_]
+    usable: Mask
 
 
 def open_messages(path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions) -> Recording:

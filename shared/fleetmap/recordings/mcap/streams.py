@@ -11,10 +11,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Mask
 from fleetmap.recordings import limits
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize, logged_calibration
@@ -279,7 +278,7 @@ def assemble(
     roles: Roles,
     calibrate: Callable[[str | None], tuple[RigCalibration, Sequence[str]]],
     log: ReadLog,
-    usable: Mapping[str, NDArray[np.bool_]] = MappingProxyType({}),
+    usable: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Recording:
     """Build a recording from the streams by their roles; its issues list unreadable messages.
 
@@ -322,9 +321,7 @@ def assemble(
     return finalize(RecordingParts(path, file_format, calibration, frames, name=name, **sensors), log)
 
 
-def _images(
-    streams: Sequence[ImageStream], what: str, log: ReadLog, usable: NDArray[np.bool_] | None = None
-) -> ImageSeries:
+def _images(streams: Sequence[ImageStream], what: str, log: ReadLog, usable: Mask | None = None) -> ImageSeries:
     images = [(stream.channel, *image) for stream in streams for image in stream.images]
     if damaged := sum(stream.damaged for stream in streams):
         why = next(stream.why_damaged for stream in streams if stream.why_damaged)
