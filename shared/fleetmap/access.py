@@ -20,7 +20,6 @@ _MOST_HZ = {"ack": 10.0, "health": 10.0, "pose": 60.0, "estimate": 60.0}
 _REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20
 _NOBODY = "-"
 
-
 # Zenoh's words for the direction of a message, as the server sees it, and for its kind
 Direction = Literal["ingress", "egress"]
 Act = Literal[

@@ -86,14 +86,13 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hoo
         def list_commands(self, ctx: Any) -> list[str]:
             return [*super().list_commands(ctx), *self.others]
 
-    settings: dict[str, Any] = {"obj": read_config, "max_content_width": 140}
     app = typer.Typer(
         cls=WithPlugins,
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,  # framed help would cost every call 0.3 s
-        context_settings=settings,
+        context_settings={"obj": read_config, "max_content_width": 140},
     )
     app.callback()(callback)
     for name, command in commands.items():

@@ -67,11 +67,6 @@ class SearchClock:
         self._last_ns: int | None = None
         self._driven_s = self._stood_s = 0.0
 
-    @property
-    def is_over(self) -> bool:
-        """True if the search has lasted long enough to be a failure."""
-        return self._driven_s >= FIND_DRIVING_S or self._stood_s >= FIND_AT_REST_S
-
     def handle(self, stamp_ns: int, *, is_found: bool, is_driving: bool, may_be_mapped: bool = True) -> bool:
         """Add a frame or report at stamp_ns, which covers the time since the previous one; return True if the search is a failure.
 
@@ -88,7 +83,7 @@ class SearchClock:
             self._driven_s += dt_s
         elif may_be_mapped:
             self._stood_s += dt_s
-        return self.is_over
+        return self._driven_s >= FIND_DRIVING_S or self._stood_s >= FIND_AT_REST_S
 
 
 def is_outside_bound(error_map_m: Array, cov_rot_trans: Array) -> bool:

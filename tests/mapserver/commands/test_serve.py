@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 
 import httpx
@@ -94,8 +93,7 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
     context = typer.Context(typer.main.get_command(cli.app), obj=lambda _: (MapserverConfig(), {}))
 
     def serve_at(http: str, zenoh: str, **more: object) -> None:
-        options = asdict(HttpOptions(http=http)) | more
-        serve(context=context, store=tmp_path, zenoh=zenoh, config=None, **options)
+        serve(context, tmp_path, HttpOptions(http=http, **more), zenoh)
 
     with pytest.raises(UsageError, match="--http 'nonsense'"):
         serve_at("nonsense", "tcp/127.0.0.1:0")
