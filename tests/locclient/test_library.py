@@ -10,7 +10,6 @@ from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
 from locclient import LocalizeOptions, LocalizerSettings, MapView, Relocalizer, fetch_map, finished, localize
 from locclient.maps.map_client import MapClient
-from mapserver.store import MapStore
 from support.recordings.recording_samples import write_mcap
 from support.worlds import robot_world
 
@@ -19,10 +18,7 @@ FRAMES = 40
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("maps") / "store"
-    with MapStore.open(folder, create=True) as maps:
-        robot_world.save(maps)
-    return folder
+    return robot_world.stored(tmp_path_factory.mktemp("maps") / "store")
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,7 @@
 
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
@@ -24,7 +23,7 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from fleetmap.sensors.samples import CameraFrame, WheelSample
+from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetmap.version_grid import OccupancyGrid
@@ -53,6 +52,7 @@ from mapserver.serving.bus_service import BusService, place_robot
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
+from support.waiting import eventually
 from support.worlds import robot_world
 from support.worlds.building import house
 
@@ -64,21 +64,24 @@ class ScriptedSource:
     bundles: list[SensorBundle]
     before: dict[int, Callable[[], None]] = field(default_factory=dict)
     ready: Callable[[], bool] = lambda: True
+    at_once: int = 1  # frames, of which the last is taken
     calibration = calibration()
     has_depth = False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         while not self.ready() and not wait(0.01):
             pass
-        for number, bundle in enumerate(self.bundles):
+        for first in range(0, len(self.bundles), self.at_once):
             while not intake.wait_for_room(0.1) and not wait(0.0):
                 pass
-            self.before.get(number, lambda: None)()
-            intake.put_imu(bundle.imu)
-            for sample in bundle.wheel:
+            self.before.get(first, lambda: None)()
+            crowd = self.bundles[first : first + self.at_once]
+            for sample in (sample for bundle in crowd for sample in bundle.wheel):
                 intake.put_wheel(sample)
-            assert bundle.frame is not None
-            intake.put_frame(bundle.frame)
+            for bundle in crowd:
+                intake.put_frame(bundle.frame)
+            for bundle in crowd:  # without its samples no frame is taken
+                intake.put_imu(bundle.imu)
 
     def close(self) -> None:
         pass
@@ -119,9 +122,8 @@ class World:
         client = MapClient(self.bus, caches[0], "room", "r1")
         outbox = Outbox(self.folder / "spool", max_bytes=10**7)
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
-        rig, settings = robot_world.rectifier(), robot_world.SETTINGS
         return RuntimeParts(
-            profile=RobotProfile("room", "r1", rig.rig, settings),
+            profile=RobotProfile("room", "r1", robot_world.rectifier().rig, robot_world.SETTINGS),
             source=source,
             intake=intake,
             robot=robot,
@@ -136,13 +138,18 @@ class World:
 
     def drive(
         self, bundles: list[SensorBundle], before: dict[int, Callable[[], None]] | None = None, *,
-        robot: Robot | None = None, source: type[ScriptedSource] = ScriptedSource,
+        robot: Robot | None = None, at_once: int = 1,
     ) -> list[Estimate]:  # fmt: skip
         """What a robot tells that gets these once it has its map; does something before some of them."""
-        robot, listener = robot or robot_world.new_robot(), Listener()
-        scripted = source(bundles, before or {}, ready=lambda: robot.running is not None)
-        Runtime(self.parts(scripted, robot, listener), ServiceManager("")).run()
-        return listener.estimates
+        robot = robot or robot_world.new_robot()
+        source = ScriptedSource(bundles, before or {}, lambda: robot.running is not None, at_once)
+        return started(self.parts(source, robot, Listener()))
+
+
+def started(parts: RuntimeParts) -> list[Estimate]:
+    """The robot's estimates until its source ends."""
+    Runtime(parts, ServiceManager("")).run()
+    return parts.publisher.estimates  # type: ignore[attr-defined]
 
 
 @pytest.fixture
@@ -157,9 +164,8 @@ def world(tmp_path: Path) -> Iterator[World]:
             made.table.append(decode_message(payload, FailureReport).id)
             return encode_message(fleet.take_failure_bytes("room", "r1", payload))
 
-        bus.queryable(
-            robot_key("*", "*", "failures"), take
-        )  # before the service's own table: what arrives is looked at here
+        # Before the service's own table: what arrives is looked at here.
+        bus.queryable(robot_key("*", "*", "failures"), take)
         service = BusService(store, fleet, bus, lambda *_: None)
         yield made
         service.close()
@@ -172,22 +178,17 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(
     caplog.set_level("INFO")
     bundles = list(robot_world.bundles(130, dark=range(60, 100)))
     folder = LocalMapSource(world.folder / "store", "room")
-    whole = TileLoader(folder, TileSelectionSettings()).load(folder.wanted(), PositionBound())
-    assert whole is not None
-    alone = robot_world.new_robot()
-    alone.use(whole)
-    expected = [outcome.estimate for outcome in map(alone.handle, bundles) if outcome is not None]
-
-    robot, listener = robot_world.new_robot(), Listener()
+    alone, robot = robot_world.new_robot(), robot_world.new_robot()
+    alone.use(TileLoader(folder, TileSelectionSettings()).load(folder.wanted(), PositionBound()))
+    expected = [outcome.estimate for outcome in map(alone.handle, bundles)]
     away, back = (lambda: setattr(world.hub, "reachable", False)), (lambda: setattr(world.hub, "reachable", True))
     delivered_while_away: list[int] = []
     steps = {30: away, 119: lambda: delivered_while_away.append(len(world.table)), 120: back}
     source = ScriptedSource(bundles, steps, ready=lambda: robot.running is not None)
-    parts = world.parts(source, robot, listener)
-    runtime = Runtime(parts, ServiceManager(""))
-    runtime.run()
-    assert [e.stamp_ns for e in listener.estimates] == [e.stamp_ns for e in expected]
-    for got, wanted in zip(listener.estimates, expected, strict=True):
+    parts = world.parts(source, robot, Listener())
+    estimates = started(parts)
+    assert [e.stamp_ns for e in estimates] == [e.stamp_ns for e in expected]
+    for got, wanted in zip(estimates, expected, strict=True):
         assert (got.status, got.refused) == (wanted.status, wanted.refused)
         if wanted.map_from_body is not None:
             np.testing.assert_array_equal(got.map_from_body, wanted.map_from_body)
@@ -195,35 +196,23 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(
     assert delivered_while_away == [0]
     waiting = [report.id for report in parts.outbox.waiting(10)]
     world.hub.reachable = True
-    last = ServerSync(parts.server.client, parts.outbox, retry_s=600.0)  # the next start delivers what was not yet
-    last.step()
+    ServerSync(parts.server.client, parts.outbox, retry_s=600.0).step()  # the next start delivers what was not yet
     assert len(world.table) == len(set(world.table)) == 1
     assert waiting in ([], world.table)
     assert world.fleet.robots("room")[0].last_ack["version"] == 1
     told = [record.getMessage() for record in caplog.records if record.name.startswith("locclient")]
     assert [line for line in told if line.startswith("version")] == ["version 1 is fetched", "version 1 is adopted"]
-    statuses = [status for status, _ in groupby(estimate.status for estimate in listener.estimates)]
+    statuses = [status for status, _ in groupby(estimate.status for estimate in estimates)]
     assert [line.split()[1].rstrip(",") for line in told if line.startswith("status")] == statuses
     assert any(re.fullmatch(r"status TRACKING, version 1, position known to 0\.\d\d m \(95 %\)", line) for line in told)
     assert f"the report of failure {world.table[0]} is delivered" in told
 
 
-@dataclass
-class CrowdedSource(ScriptedSource):
-    """Puts four frames at once, of which the last is taken."""
-
-    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        while not self.ready() and not wait(0.01):
-            pass
-        for first in range(0, len(self.bundles), 4):
-            while not intake.wait_for_room(0.1) and not wait(0.0):
-                pass
-            crowd = self.bundles[first : first + 4]
-            for bundle in crowd:
-                assert bundle.frame is not None
-                intake.put_frame(bundle.frame)
-            for bundle in crowd:  # without its samples no frame is taken
-                intake.put_imu(bundle.imu)
+def check_tracking(said: Iterable[tuple[int, Estimate]]) -> None:
+    for number, one in said:
+        off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
+        assert one.status is Status.TRACKING
+        assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
 
 
 def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
@@ -235,11 +224,8 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
     for number, bundle in enumerate(bundles[160:], 160):
         noise = rng.integers(0, 255, bundle.frame.left.shape, np.uint8)
         bundles[number] = replace(bundle, frame=CameraFrame(bundle.frame.stamp_ns, noise, noise))
-    said = world.drive(bundles, source=CrowdedSource)
-    for number, one in zip(range(3, 160, 4), said, strict=False):
-        off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
-        assert one.status is Status.TRACKING
-        assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
+    said = world.drive(bundles, at_once=4)
+    check_tracking(zip(range(3, 160, 4), said, strict=False))
     assert Cause.OVERLOADED in {one.cause for one in said[40:]}
     (status,) = world.fleet.robots("room")
     lines = [record.getMessage() for record in caplog.records]
@@ -247,9 +233,8 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
     told = "75% of its frames are dropped"
     assert told in " ".join(remarks(live_robot(status)))
     alerts = active_alerts(world.store, world.fleet, AlertSettings(), world.store.now_ns())
-    assert [alert.about for alert in alerts if alert.name == "FleetmapRobotOverloaded" and told in alert.words] == [
-        "r1"
-    ]
+    (alert,) = (alert for alert in alerts if alert.name == "FleetmapRobotOverloaded" and told in alert.words)
+    assert alert.about == "r1"
     assert 'fleetmap_site_robots_overloaded{site="room"} 1.0' in Metrics(world.store, world.fleet).text().decode()
 
 
@@ -257,8 +242,7 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
 def test_the_recording_of_a_failure_at_the_end_has_arrived(
     world: World, monkeypatch: pytest.MonkeyPatch, is_stopped: bool
 ) -> None:
-    robot = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
-    bundles = list(robot_world.bundles(110, dark=range(60, 110)))
+    robot, bundles = robot_world.new_robot(keeps_replay=True), list(robot_world.bundles(110, dark=range(60, 110)))
     plain = world.parts(ScriptedSource(bundles, ready=lambda: robot.running is not None), robot, Listener())
     spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
     made = Runtime(plain._replace(replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
@@ -292,23 +276,19 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
         current = robot_world.wanted(world.store)
         with MemoryBus(world.hub) as server:
             server.publish(robot_key("room", "r1", "wanted"), encode_message(current))
-        deadline = time.monotonic() + 20
-        while (
-            len(robot.versions.held) < 2 and time.monotonic() < deadline
-        ):  # the thread that localizes takes it between frames
-            time.sleep(0.01)
+        assert eventually(lambda: len(robot.versions.held) == 2, 20), (
+            "taken by the thread that localizes, between frames"
+        )
 
     source.before[70] = publish
-    runtime = Runtime(parts, ServiceManager(""))
-    runtime.run()
-    assert listener.estimates[-1].map_version == 2
-    assert [e.cause for e in listener.estimates[60:] if e.status != "TRACKING"] == []
+    estimates = started(parts)
+    assert estimates[-1].map_version == 2
+    assert [e.cause for e in estimates[60:] if e.status != "TRACKING"] == []
     (first, none, why), (second, grid, _) = listener.grids
     assert (first, none, second) == (1, None, 2)
     assert "version 1 of site room has no grid" in why
     assert ((grid.cells == 100).sum(), (grid.cells == 0).sum()) == (400, 800)
-    active = parts.server.client.active()
-    assert active.version == 2
+    assert parts.server.client.active().version == 2
     assert world.fleet.robots("room")[0].version == 2
 
 
@@ -345,27 +325,21 @@ def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: 
     said = world.drive(bundles)
     assert [one.stamp_ns for one in said[-99:]] == [b.frame.stamp_ns for b in bundles if b is not bundles[at]]
     assert {one.status for one in said[35:67]} == {said[-1].status} == {Status.TRACKING}
-    off_m = said[-1].map_from_body[:3, 3] - robot_world.truth(99)[:3, 3]
-    assert np.linalg.norm(off_m) < 0.1
+    assert np.linalg.norm((said[-1].map_from_body - robot_world.truth(99))[:3, 3]) < 0.1
 
 
 @pytest.mark.parametrize("is_imu", [True, False])
 def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: World, is_imu: bool) -> None:
     """Of wheels or an IMU. That of the cameras, and thus of all, ends the run."""
-    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(110))
+    bundles = list(robot_world.bundles(110))
     for number, bundle in enumerate(bundles):
-        back_ns = 10**10 if number >= 60 else 0
-        earlier_from_now = se3_inverse(robot_world.truth(number - 1)) @ robot_world.truth(number)
-        speed_mps = (robot.base_from_body @ earlier_from_now @ se3_inverse(robot.base_from_body))[:3, 3] / 0.1
-        wheel = WheelSample(bundle.frame.stamp_ns - (0 if is_imu else back_ns), speed_mps, 0.0, 0.02, 0.02)
-        imu = replace(bundle.imu, stamps_ns=bundle.imu.stamps_ns - back_ns) if is_imu else bundle.imu
-        bundles[number] = replace(bundle, imu=imu, wheel=[wheel])
-    said = world.drive(bundles, robot=robot)
+        imu_ns, wheels_ns = (10**10 if number >= 60 and is_back else 0 for is_back in (is_imu, not is_imu))
+        wheel = robot_world.rolled(number, bundle.frame.stamp_ns - wheels_ns)
+        imu = replace(bundle.imu, stamps_ns=bundle.imu.stamps_ns - imu_ns)
+        bundles[number] = replace(bundle, imu=imu, wheel=wheel)
+    said = world.drive(bundles)
     assert [one.stamp_ns for one in said] == [bundle.frame.stamp_ns for bundle in bundles]
-    for number, one in list(enumerate(said))[35:]:
-        off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
-        assert one.status is Status.TRACKING
-        assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
+    check_tracking(list(enumerate(said))[35:])
     (status,) = world.fleet.robots("room")
     assert status.last_health["flags"] == ("imu_refused" if is_imu else "wheels_refused",)
 
@@ -407,8 +381,8 @@ def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
 
 
 def test_a_picture_that_cannot_be_read_costs_itself(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot, listener = robot_world.new_robot(), Listener()
-    handle, bundles = robot.handle, list(robot_world.bundles(6))
+    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(6))
+    handle = robot.handle
 
     def sometimes(bundle: SensorBundle) -> object:
         if bundle.frame is bundles[2].frame:
@@ -416,9 +390,8 @@ def test_a_picture_that_cannot_be_read_costs_itself(world: World, monkeypatch: p
         return handle(bundle)
 
     monkeypatch.setattr(robot, "handle", sometimes)
-    parts = world.parts(ScriptedSource(bundles), robot, listener)
-    Runtime(parts, ServiceManager("")).run()
-    assert len(listener.estimates) == 5
+    parts = world.parts(ScriptedSource(bundles), robot, Listener())
+    assert len(started(parts)) == 5
     assert parts.intake.counts.unreadable == 1
 
 
@@ -426,15 +399,13 @@ def test_faults_of_the_tile_cache_reach_the_server(world: World) -> None:
     record = world.folder / "cache" / "sites" / "room" / "active"
     record.parent.mkdir(parents=True)
     record.write_bytes(b"damaged")
-    parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
-    Runtime(parts, ServiceManager("")).run()
-    assert world.fleet.robots("room")[0].last_health["metrics"]["cache_faults"] == len(parts.caches)
+    world.drive(list(robot_world.bundles(3)))
+    assert world.fleet.robots("room")[0].last_health["metrics"]["cache_faults"] == 2
 
 
 def test_a_robot_that_ends_without_frames_says_so(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "_SILENT_S", -1.0)
-    parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
-    Runtime(parts, ServiceManager("")).run()
+    started(world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener()))
     assert Cause.NO_FRAMES.value in world.fleet.robots("room")[0].last_health["flags"]
 
 
@@ -447,12 +418,10 @@ def test_a_spool_that_refuses_costs_no_estimate(
     def refuse(*_: object) -> object:
         raise error
 
-    listener = Listener()
-    parts = world.parts(ScriptedSource(list(robot_world.bundles(5))), robot_world.new_robot(), listener)
+    parts = world.parts(ScriptedSource(list(robot_world.bundles(5))), robot_world.new_robot(), Listener())
     for name in ("waiting", "put", *["counts"] * isinstance(error, StoreError)):
         monkeypatch.setattr(parts.outbox, name, refuse)
-    Runtime(parts, ServiceManager("")).run()
-    assert len(listener.estimates) == 5
+    assert len(started(parts)) == 5
     assert world.fleet.robots("room")[0].last_health is not None
 
 

@@ -1,9 +1,10 @@
 """Attacks on a robot's map: by any participant of the bus, by a thief of the server, by replay. Each with its control."""
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -43,10 +44,7 @@ class World:
     hub: MemoryHub
     stack: ExitStack
     store: MapStore
-    fleet: Fleet
-    service: BusService
     ahead_s: float = 0.0
-    buses: list[MemoryBus] = field(default_factory=list)
 
     @property
     def trust_folder(self) -> Path:
@@ -60,21 +58,21 @@ class World:
         bus = self.bus()
         client = MapClient(bus, TileCache(self.folder / name), SITE, ROBOT)
         if trusting:
-            root = (self.trust_folder / "1.root.json").read_bytes()
-            ask, folder = ask_over(bus, SITE, ROBOT), self.folder / name / "trust" / SITE
-
-            def wall_s() -> float:
-                return datetime.now(UTC).timestamp() + self.ahead_s
-
-            client.trust = TrustedMap(folder, SITE, root, ask, wall_s)
+            root, folder = (self.trust_folder / "1.root.json").read_bytes(), self.folder / name / "trust" / SITE
+            ask = ask_over(bus, SITE, ROBOT)
+            client.trust = TrustedMap(folder, SITE, root, ask, lambda: datetime.now(UTC).timestamp() + self.ahead_s)
         return client
+
+    def sync(self, client: MapClient, clock_s: Callable[[], float] = time.monotonic) -> ServerSync:
+        outbox = Outbox(self.folder / "outbox", max_bytes=10**6)
+        return self.stack.enter_context(closing(ServerSync(client, outbox, retry_s=600.0, clock_s=clock_s)))
+
+    def answer_first(self, what: str, answer: Callable[[str, bytes], bytes]) -> None:
+        self.hub.queryables.insert(0, (robot_key(SITE, ROBOT, what), answer, None))
 
     def publish(self, seed: int) -> int:
         save_sample_draft(self.store, seed=seed)
         return releases.publish(self.store, SITE)
-
-    def repository(self) -> ListRepository:
-        return ListRepository(self.store.folder, datetime.now(UTC))
 
     def attacker(self, versions: int = 3) -> BusService:
         """Answers first, with maps and lists of its own; its version 3 is not the honest one."""
@@ -95,16 +93,15 @@ def world(tmp_path: Path) -> Iterator[World]:
         store = stack.enter_context(MapStore.open(tmp_path / "store", create=True))
         publish_samples(store, 2)
         init_here(store)
-        fleet = Fleet(store)
-        service = BusService(store, fleet, stack.enter_context(MemoryBus(hub)), lambda *_: None)
-        yield World(tmp_path, hub, stack, store, fleet, service)
+        BusService(store, Fleet(store), stack.enter_context(MemoryBus(hub)), lambda *_: None)
+        yield World(tmp_path, hub, stack, store)
 
 
 def want(world: World, version: int, sha256: str | None = None) -> None:
     """Whoever answers `wanted` names this version, with the honest manifest's address unless another is given."""
     address = world.store.version(SITE, version).manifest_sha256 if sha256 is None else sha256
     answer = encode_message(WantedVersion(site=SITE, version=version, manifest_sha256=address))
-    world.hub.queryables.insert(0, (robot_key(SITE, ROBOT, "wanted"), lambda *_: answer, None))
+    world.answer_first("wanted", lambda *_: answer)
 
 
 def running(client: MapClient) -> int | None:
@@ -134,7 +131,7 @@ def test_row_4_a_thief_of_the_online_key(world: World, attempt: str) -> None:
     world.publish(seed=3)
     client = world.client()
     assert client.ready().wanted.version == 4
-    repository, lists = world.repository(), SignedLists(world.store.folder)
+    repository, lists = ListRepository(world.store.folder, datetime.now(UTC)), SignedLists(world.store.folder)
     online = KeyFolder(world.store.folder / "keys").signer("online")
     number = lists.newest("site-lab")
     if attempt in ("forged", "site list of the thief"):
@@ -206,12 +203,9 @@ def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
     """The list says its size: of a larger one the first part ends it."""
     client, victim = world.client(), world.client("victim", trusting=False)
     info = world.store.version(SITE, 2)
-    length = info.manifest_bytes
     data = world.store.blob(info.manifest_sha256) + bytes(3_000_000)
-    world.hub.queryables.insert(
-        0, (robot_key(SITE, ROBOT, "manifests/2"), lambda _, question: part_of(data, question), None)
-    )
-    with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {length} are expected"):
+    world.answer_first("manifests/2", lambda _, question: part_of(data, question))
+    with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {info.manifest_bytes} are expected"):
         client.fetch(client.wanted())
     assert client.chunks.received_bytes <= PART_BYTES
     with pytest.raises(FleetmapError):  # the control: without a signed size it takes them all before it looks
@@ -234,13 +228,10 @@ def test_a_version_that_begins_to_be_run_is_finished(world: World) -> None:
         world.client().manifest(first)  # the control: after a restart it would be new
 
 
-@pytest.mark.parametrize(("versions", "kind"), [(3, "signature: "), (1, "signature: ")])
-def test_the_server_hears_the_kind_of_attack(world: World, versions: int, kind: str) -> None:
-    client = world.client()
+@pytest.mark.parametrize("versions", [3, 1])
+def test_the_server_hears_the_kind_of_attack(world: World, versions: int) -> None:
     clock = {"s": 1000.0}
-    sync = ServerSync(
-        client, Outbox(world.folder / "outbox", max_bytes=10**6), retry_s=600.0, clock_s=lambda: clock["s"]
-    )
+    sync = world.sync(world.client(), lambda: clock["s"])
     sync.step()
     wanted = sync.fetched.popleft()
     sync.changes.append(VersionChange(wanted, Change.ADOPTED))
@@ -252,19 +243,17 @@ def test_the_server_hears_the_kind_of_attack(world: World, versions: int, kind: 
     sync.step()
     last = decode_message(heard[-1], RobotAck)
     assert last.version == 2
-    assert last.refused.startswith(kind)
+    assert last.refused.startswith("signature: ")
     assert not sync.fetched
-    sync.close()
 
 
 def test_a_robot_without_a_map_takes_no_strangers_either(world: World) -> None:
     """Elsewhere an incomplete first version is better than none."""
     world.attacker()
     client = world.client("new")
-    sync = ServerSync(client, Outbox(world.folder / "outbox", max_bytes=10**6), retry_s=600.0)
+    sync = world.sync(client)
     sync.step()
     assert (list(sync.fetched), running(client)) == ([], None)
-    sync.close()
 
 
 def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
@@ -282,11 +271,13 @@ def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
         service.close()
 
 
-def align(world: World, x_m: float) -> None:
-    """As `mapserver align` keeps it; whatever signs has not looked yet."""
+def align(world: World, x_m: float, *, is_signed: bool = True) -> None:
+    """As `mapserver align` keeps it; unless whatever signs has not looked yet."""
     frame = BuildingFrame(x_m=x_m, y_m=2.0, yaw_rad=0.5)
     found = encode_alignment(Alignment(frame=frame, metres_per_unit=0.05, method="pins"))
     world.store.keep_site_files(SITE, {ALIGNMENT: found, PLAN: b"the drawing"}, "aligned")
+    if is_signed:
+        update_lists(world.store)
 
 
 def learned(client: MapClient) -> float | None:
@@ -298,7 +289,7 @@ def learned(client: MapClient) -> float | None:
 
 def followed(world: World, client: MapClient) -> tuple[ServerSync, Callable[[], list[float]]]:
     """The exchange with the server, and what the robot itself has been told of that origin."""
-    sync = ServerSync(client, Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
+    sync = world.sync(client)
     sync.building = building = BuildingMaps(client, lambda _: client)
     building.refresh(asks=False)
     return sync, lambda: [change.frame.x_m for change in building.changes if change.frame is not None]
@@ -309,7 +300,6 @@ def test_a_robot_learns_an_alignment_without_another_version(world: World) -> No
     client.ready()
     assert learned(client) is None
     align(world, 7.0)
-    update_lists(world.store)
     assert learned(client) == 7.0
     assert running(client) == 2
     received = client.chunks.received_bytes
@@ -323,7 +313,6 @@ def test_a_robot_learns_an_alignment_without_another_version(world: World) -> No
     assert places() == [7.0]
     world.hub.reachable = True
     align(world, 8.0)
-    update_lists(world.store)
     sync.step()
     assert places() == [7.0, 8.0]
     world.store.keep_site_files(SITE, {ALIGNMENT: None}, "forgotten")
@@ -336,16 +325,14 @@ def test_an_alignment_that_nobody_signed_or_that_is_damaged_changes_nothing(
 ) -> None:
     client = world.client()
     align(world, 7.0)
-    update_lists(world.store)
     assert learned(client) == 7.0
     # A thief of the server's database has no key of the site.
-    align(world, 666.0)
+    align(world, 666.0, is_signed=False)
     assert learned(client) == 7.0
     update_lists(world.store)
     assert learned(world.client("control")) == 666.0
     # The bytes are others than those that were signed.
     align(world, 9.0)
-    update_lists(world.store)
     (entry,) = [e for e in SignedLists(world.store.folder).served(SITE).admitted if e.about.state == "current"]  # type: ignore[union-attr]
     path = world.store.folder / blob_path(entry.about.files[ALIGNMENT])
     path.write_bytes(path.read_bytes()[:-1] + b" ")

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -228,21 +229,16 @@ def test_every_method_of_the_cache_on_a_disk_that_refuses(kind: str) -> None:
         assert found["refused"] == [True] * 3
         assert (found["contains"], found["room"], bool(found["faults"])) == (False, True, True)
         again = TileCache(folder)
-        assert (again.active("hall"), again.kept("hall"), again.get(ONE.blobs[0])) == (ONE, [TWO], TILE), (
-            "nothing is lost"
-        )
+        found = again.active("hall"), again.kept("hall"), again.get(ONE.blobs[0])
+        assert found == (ONE, [TWO], TILE), "nothing is lost"
 
 
 def test_a_read_that_fails_once_costs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(tmp_path)
     cache = TileCache(tmp_path)
     for number in (5, 24):  # EIO, EMFILE
-
-        def refuse(path: Path, number: int = number) -> bytes:
-            raise OSError(number, os.strerror(number), str(path))
-
         with monkeypatch.context() as patch:
-            patch.setattr(Path, "read_bytes", refuse)
+            patch.setattr(Path, "read_bytes", Mock(side_effect=OSError(number, os.strerror(number), "x")))
             assert cache.get(ONE.blobs[0]) is None
         assert os.strerror(number) in cache.last_fault
         assert cache.get(ONE.blobs[0]) == TILE
@@ -260,7 +256,7 @@ def test_lists_reports_and_identity_refuse_with_a_sentence_and_begin_again(kind:
             (folder / "identity" / name).write_text("{}")
 
         def use() -> list[str]:
-            trust = TrustedMap(folder / "trust", "hall", None, away)
+            trust = TrustedMap(folder / "trust", "hall", None, Mock(side_effect=UnreachableError("nobody answers")))
             trust.refresh()
             outbox = Outbox(spool, max_bytes=10**6)
             identity = RobotIdentity(folder / "identity", None)  # type: ignore[arg-type]
@@ -290,10 +286,6 @@ class Report(msgspec.Struct):
     kind: str = "blind"
     cause: str = "dark"
     thumbnails: tuple[()] = ()
-
-
-def away(_: str) -> bytes | None:
-    raise UnreachableError("nobody answers")
 
 
 def test_a_spool_that_cannot_be_made_is_made_once_the_disk_lets_it(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Tiles around the robot are in memory, the others on the disk; bad ones are left out with their reasons; maps of other floors follow."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -52,10 +52,8 @@ def row(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, MapSto
     folder = tmp_path_factory.mktemp("row") / "store"
     rng = np.random.default_rng(0)
     with MapStore.open(folder, create=True) as store:
-        tiles = [random_tile(rng, cell=(x, 0)) for x in range(10)]
-        store.save(
-            "row", DraftContent(tiles=tiles, vocabulary=vocabulary(), details=draft_details(path_m=160.0), archive=b"a")
-        )
+        tiles, details = [random_tile(rng, cell=(x, 0)) for x in range(10)], draft_details(path_m=160.0)
+        store.save("row", DraftContent(tiles=tiles, vocabulary=vocabulary(), details=details, archive=b"a"))
         releases.publish(store, "row")
         yield folder, store
 
@@ -156,6 +154,7 @@ def test_a_damaged_current_file_is_told(tmp_path: Path) -> None:
 
 
 ROBOT = "r1"
+BEYOND = FloorEntry(site="high", level="L1", height_m=0.0), FloorEntry(site="third", level="L9", height_m=4.0)
 
 
 class Network:
@@ -163,9 +162,8 @@ class Network:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.cache, self.hub, self._stack = folder / "cache", MemoryHub(), stack
-        self.store = stack.enter_context(
-            house(folder / "store", robot_world.tiles(), robot_world.tiles(), has_grid=True)
-        )
+        tiles = robot_world.tiles()
+        self.store = stack.enter_context(house(folder / "store", tiles, tiles, has_grid=True))
         init_here(self.store)
         self.bus = stack.enter_context(MemoryBus(self.hub))
         self.service = BusService(self.store, Fleet(self.store), self.bus, lambda *_: None)
@@ -180,10 +178,12 @@ class Network:
             made.trust = TrustedMap(self.cache / "trust" / site, site, root, ask_over(bus, site, ROBOT, 0.2))
             return made
 
-        own = client("low")
-        if self.service is not None:
+        own, is_served = client("low"), self.service is not None
+        if is_served:
             own.bring(own.wanted())
-        return BuildingMaps(own, client)
+        floors = BuildingMaps(own, client)
+        floors.refresh(asks=is_served)
+        return floors
 
 
 @pytest.fixture
@@ -193,16 +193,13 @@ def network(tmp_path: Path) -> Iterator[Network]:
 
 
 def test_floors_come_by_signed_lists(network: Network) -> None:
-    floors = network.floors()
-    floors.refresh()
-    (change,) = floors.changes
+    (change,) = network.floors().changes
     assert [(loaded.wanted.site, loaded.version) for loaded in change.maps] == [("high", 1)]
     assert change.building["high"].entry.level == "L1"
 
 
 def test_a_version_that_is_not_signed_is_not_taken(network: Network) -> None:
     floors = network.floors()
-    floors.refresh()
     keys = network.store.folder / "keys" / "site-high.pem"
     keys.rename(keys.with_suffix(".away"))
     robot_world.save(network.store, site="high")
@@ -217,12 +214,10 @@ def test_a_version_that_is_not_signed_is_not_taken(network: Network) -> None:
 @pytest.mark.parametrize("record", [None, "tower of others", "annex"])
 def test_a_site_that_is_no_floor_of_this_building_is_none(network: Network, record: str | None) -> None:
     """Its own signed list says where it belongs: a building that one of its sites alone names is half a change."""
-    floors = (FloorEntry(site="high", level="L1", height_m=0.0), FloorEntry(site="third", level="L9", height_m=4.0))
-    data = None if record is None else to_json(Building(name=record, floors=floors))
+    data = None if record is None else to_json(Building(name=record, floors=BEYOND))
     network.store.keep_site_files("high", {FLOORS: data}, "")
     update_lists(network.store)
     floor_maps = network.floors()
-    floor_maps.refresh()
     (change,) = floor_maps.changes
     assert (list(change.building), change.maps) == (["", "high"], []), "where it may be, without a map"
     network.store.keep_site_files("high", {FLOORS: network.store.site_file("low", FLOORS)}, "")
@@ -232,12 +227,9 @@ def test_a_site_that_is_no_floor_of_this_building_is_none(network: Network, reco
 
 
 def test_a_building_without_the_robots_own_site_is_not_taken(network: Network) -> None:
-    floors = (FloorEntry(site="high", level="L1", height_m=0.0), FloorEntry(site="third", level="L9", height_m=4.0))
-    floor_maps = network.floors()
-    network.store.keep_site_files("low", {FLOORS: to_json(Building(name="tower", floors=floors))}, "")
+    network.store.keep_site_files("low", {FLOORS: to_json(Building(name="tower", floors=BEYOND))}, "")
     update_lists(network.store)
-    floor_maps.refresh()
-    assert not floor_maps.changes
+    assert not network.floors().changes
 
 
 def test_another_sites_map_is_not_taken_for_a_floors(network: Network) -> None:
@@ -251,19 +243,15 @@ def test_another_sites_map_is_not_taken_for_a_floors(network: Network) -> None:
 
 
 def test_without_a_server_the_disk_has_them(network: Network) -> None:
-    with_server = network.floors()
-    with_server.refresh()
+    network.floors()
     network.service.close()
     network.service = None  # type: ignore[assignment]
-    floors = network.floors()
-    floors.refresh(asks=False)
-    assert [loaded.version for loaded in floors.changes[-1].maps] == [1]
+    assert [loaded.version for loaded in network.floors().changes[-1].maps] == [1]
 
 
 def test_planners_get_the_grid_of_a_floor_that_came_without(network: Network) -> None:
-    network.floors().refresh()
+    network.floors()
     floors = network.floors(takes_grid_of="high")
-    floors.refresh()
     loader = TileLoader(CachedMap(TileCache(network.cache), "low"), TileSelectionSettings())
     assert (loader.grid(floors.held["high"], 1.0).cells == 100).any()
 
@@ -274,18 +262,16 @@ DATA = bytes(range(256)) * 3000  # three parts
 WHOLE = PART_BYTES + 5
 
 
-def answered(*parts: Part) -> ChunkReader:
-    """A reader of a server that answers these, whatever is asked."""
-    hub, left = MemoryHub(), list(parts)
-    MemoryBus(hub).queryable("x", lambda *_: encode_message(left.pop(0)))
+def answered(**answers: Callable[[str, bytes], bytes]) -> ChunkReader:
+    """A reader of a server with these answers."""
+    hub = MemoryHub()
+    for key, answer in answers.items():
+        MemoryBus(hub).queryable(key, answer)
     return ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
 
 
 def test_parts_become_the_whole() -> None:
-    hub = MemoryHub()
-    MemoryBus(hub).queryable("x", lambda _, asked: part_of(DATA, asked))
-    MemoryBus(hub).queryable("empty", lambda _, asked: part_of(b"", asked))
-    reader = ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0)
+    reader = answered(x=lambda _, asked: part_of(DATA, asked), empty=lambda _, asked: part_of(b"", asked))
     assert reader.read("x", max_bytes=len(DATA)) == DATA
     assert reader.received_bytes == len(DATA)
     assert reader.read("empty", max_bytes=0) == b""
@@ -314,32 +300,31 @@ def test_an_empty_question_asks_for_the_first_part() -> None:
     ],
 )
 def test_nonsense_is_refused(second: Part, words: str) -> None:
-    reader = answered(Part(total_bytes=WHOLE, offset=0, data=bytes(PART_BYTES)), second)
+    parts = [second, Part(total_bytes=WHOLE, offset=0, data=bytes(PART_BYTES))]
+    reader = answered(x=lambda *_: encode_message(parts.pop()))
     with pytest.raises(LinkError, match=words):
         reader.read("x", max_bytes=WHOLE)
 
 
 def test_row_15_a_server_that_gives_bytes_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    hub, asked = MemoryHub(), []
+    asked = []
 
     def slow(_: str, question: bytes) -> bytes:
         offset = decode_message(question, ChunkRequest).offset
         asked.append(offset)
         return encode_message(Part(total_bytes=500, offset=offset, data=b"x"))
 
-    MemoryBus(hub).queryable("x", slow)
+    reader = answered(x=slow)
     with pytest.raises(LinkError, match="1 bytes from byte 0 on of 500"):
-        ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
+        reader.read("x", max_bytes=500)
     assert asked == [0]
     monkeypatch.setattr(map_client, "PART_BYTES", 1)  # the control: without the rule it goes on
-    ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
+    reader.read("x", max_bytes=500)
     assert len(asked) == 501
 
 
 def test_patience_ends() -> None:
-    hub, now = MemoryHub(), [0.0]
-    bus = MemoryBus(hub)
-    asked = []
+    bus, now, asked = MemoryBus(MemoryHub()), [0.0], []
 
     def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         asked.append(key)

@@ -1,7 +1,7 @@
 """A failure's recording repeats what the robot said, within a centimetre; another map may say otherwise; what no robot wrote is refused."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,13 @@ import pytest
 import zstandard
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import se3, se3_inverse
+from fleetmap.geometry import se3_inverse
 from fleetmap.messages import FailureReport
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.delivery.failure_file import failure_file, read_failure_file
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_source import LocalMapSource
@@ -50,17 +51,15 @@ class Carried:
 
 
 @pytest.fixture(scope="module")
-def carried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Carried]:
+def carried(tmp_path_factory: pytest.TempPathFactory) -> Carried:
     folder = tmp_path_factory.mktemp("carried")
-    with MapStore.open(folder / "store", create=True) as store:
-        robot_world.save(store)
+    with MapStore.open(robot_world.stored(folder / "store")) as store:
         found = failed(robot_world.carried(140, 75), load_map(LocalMapSource(folder / "store", "room"))[0])
         # Version 2 lies half a metre higher: the same failure, other places.
         robot_world.save(store, of=robot_world.moved(np.array([0.0, 0.0, 0.5])))
-    assert found is not None
     report, data, said = found
     (folder / "failure.mcap").write_bytes(data)
-    yield Carried(folder, folder / "failure.mcap", report, said)
+    return Carried(folder, folder / "failure.mcap", report, said)
 
 
 def test_the_same_client_says_the_same(carried: Carried) -> None:
@@ -82,21 +81,23 @@ def test_it_begins_where_the_recording_says(carried: Carried) -> None:
     assert found.apart_m > 0.2
 
 
-def test_a_prior_at_its_beginning_is_kept(carried: Carried) -> None:
+def recorded(carried: Carried, folder: Path, robot: Robot, ride: list[SensorBundle], until_s: float) -> Any:
+    """The recording of a robot that fails so long after the beginning of its ride."""
+    for bundle in ride:
+        robot.handle(bundle)
+    cut = robot.ring.cut(ride[0].frame.stamp_ns + round(until_s * 1e9))
+    robot.ring.finish()
+    (folder / "failure.mcap").write_bytes(failure_file(cut, carried.report, profile(pictures="full")))
+    return read_failure_file(folder / "failure.mcap")
+
+
+def test_a_prior_at_its_beginning_is_kept(carried: Carried, tmp_path: Path) -> None:
     """A robot that has seen nothing of the map yet: its place is the prior and its way since."""
-    rig = robot_world.rectifier()
     with MapStore.open(carried.folder / "store", read_only=True) as store:
-        robot = Robot(rig, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
-        robot.use(robot_world.loaded(store))
+        robot = robot_world.new_robot(store, keeps_replay=True)
     first, *later = robot_world.bundles(90, dark=range(90))
     prior = PositionPrior(0, robot_world.truth(0) @ se3_inverse(robot.base_from_body), 0.04 * np.eye(6))
-    robot.handle(replace(first, priors=[prior]))
-    for bundle in later:
-        robot.handle(bundle)
-    cut = robot.ring.cut(first.frame.stamp_ns + 7_000_000_000)
-    robot.ring.finish()
-    (carried.folder / "prior.mcap").write_bytes(failure_file(cut, carried.report, profile(pictures="full")))
-    failure = read_failure_file(carried.folder / "prior.mcap")
+    failure = recorded(carried, tmp_path, robot, [replace(first, priors=[prior]), *later], 7.0)
     assert not failure[1].start.is_confirmed
     found = compare_failure(failure, LocalMapSource(carried.folder / "store", "room"))
     assert found.first_difference_ns is None
@@ -124,19 +125,13 @@ def test_another_version_is_asked_for_its_own_places(carried: Carried) -> None:
 
 def test_a_failure_on_another_floor_is_replayed_in_that_floors_map(carried: Carried, tmp_path: Path) -> None:
     """A robot of the lower floor that knows its place on the upper one when the recording begins."""
-    robot = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    robot = robot_world.new_robot(keeps_replay=True)
     with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0):
         floors = BuildingMaps(LocalMapSource(tmp_path, "low"), lambda site: LocalMapSource(tmp_path, site))
         floors.refresh()
         robot.use(load_map(LocalMapSource(tmp_path, "low"))[0])
         robot.use_building(*floors.changes.popleft())
-    bundles = list(robot_world.bundles(120))
-    for bundle in bundles:
-        robot.handle(bundle)
-    cut = robot.ring.cut(bundles[0].frame.stamp_ns + 10_500_000_000)
-    robot.ring.finish()
-    (tmp_path / "failure.mcap").write_bytes(failure_file(cut, carried.report, profile(pictures="full")))
-    summary, record = read_failure_file(tmp_path / "failure.mcap")
+    summary, record = recorded(carried, tmp_path, robot, list(robot_world.bundles(120)), 10.5)
     assert record.start.is_confirmed and record.start.floor == "high" and record.used.floor == "high"
     found = compare_failure((summary, record), LocalMapSource(tmp_path, "high"))
     assert {moment.status for moment in found.now} == {"TRACKING"}
@@ -153,8 +148,7 @@ def test_it_is_a_recording_with_reduced_pictures(carried: Carried) -> None:
 
 
 def test_blurred_pictures_show_no_detail(carried: Carried, tmp_path: Path) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        robot_world.save(store)
+    with MapStore.open(carried.folder / "store", read_only=True) as store:
         found = failed(robot_world.carried(90, 75), robot_world.loaded(store), "blurred")
     (tmp_path / "blurred.mcap").write_bytes(found[1])
     with open_recording(carried.file) as sharp, open_recording(tmp_path / "blurred.mcap") as blurred:
@@ -163,7 +157,6 @@ def test_blurred_pictures_show_no_detail(carried: Carried, tmp_path: Path) -> No
     assert read_failure_file(tmp_path / "blurred.mcap")[0].pictures == "blurred"
 
 
-_TURNED = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))  # body_from_turned
 _MASK = ((0.0, 0.0), (319.0, 0.0), (319.0, 60.0), (0.0, 60.0))
 
 
@@ -173,15 +166,11 @@ def test_a_robot_that_saw_the_map_behind_it_or_beside_a_mask_is_replayed_as_well
     known, ride = calibration(), list(robot_world.carried(90, 75))
     whole = replace(known, cameras=tuple(replace(camera, mask=(_MASK,)) for camera in known.cameras))
     if rig == "rear":
-        front = (replace(camera, body_from_cam=_TURNED @ camera.body_from_cam) for camera in known.cameras)
-        whole = replace(known, cameras=(*front, *known.cameras))
+        whole = replace(known, cameras=robot_world.turned(known.cameras) + known.cameras)
         dark = np.zeros_like(ride[0].frame.left)
         ride = [replace(b, frame=replace(b.frame, left=dark, right=dark, others=(b.frame,))) for b in ride]
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        robot_world.save(store)
-        found = failed(ride, robot_world.loaded(store), "full", whole)
-    assert found is not None
-    report, data, said = found
+    with MapStore.open(robot_world.stored(tmp_path / "store")) as store:
+        report, data, said = failed(ride, robot_world.loaded(store), "full", whole)
     assert (report.cause, report.view) == ("carried", 1 if rig == "rear" else None)
     np.testing.assert_allclose(
         report.camera.base_from_cam.target_from_source, known.cameras[0].body_from_cam, atol=0.02
@@ -197,9 +186,7 @@ def test_a_robot_that_saw_the_map_behind_it_or_beside_a_mask_is_replayed_as_well
     with open_recording(tmp_path / "failure.mcap") as recording:
         assert len(recording.calibration.views) == (2 if rig == "rear" else 1)
         if rig == "rear":
-            pictures = [
-                each for k in range(len(recording)) for each in recording.read_frame(k).others if each is not None
-            ]
+            pictures = [each for k in range(len(recording)) for each in recording.read_frame(k).others if each]
             assert len(pictures) > 5 and pictures[0].left.std() > 20
 
 
@@ -220,20 +207,13 @@ def _first_query(state: Any) -> Any:
     return next(query for query in queries if query and query["features"])
 
 
-def _feature(name: str, make: Callable[[int], Any]) -> Callable[[Any], None]:
+def _feature(name: str, make: Callable[[int], Any], *, is_depth: bool = False) -> Callable[[Any], None]:
     """Another array of the first map query, for its number of features."""
 
     def change(state: Any) -> None:
-        found = _first_query(state)["features"]["features"]
-        found[name] = _packed_array(make(found["pixels"][1][0]))
-
-    return change
-
-
-def _depths(make: Callable[[int], Any]) -> Callable[[Any], None]:
-    def change(state: Any) -> None:
         found = _first_query(state)["features"]
-        found["pixels"] = _packed_array(make(found["pixels"][1][0]))
+        found = found if is_depth else found["features"]
+        found[name] = _packed_array(make(found["pixels"][1][0]))
 
     return change
 
@@ -251,7 +231,7 @@ NO_ROBOT_WRITES = {
     "pixels outside the picture": _feature("pixels", lambda n: np.full((n, 2), 1e9)),
     "pixels that are no numbers": _feature("pixels", lambda n: np.full((n, 2), np.nan)),
     "too many features": _feature("pixels", lambda n: np.zeros((10_001, 2))),
-    "columns without end": _depths(lambda n: np.full((n, 3), 1e300)),
+    "columns without end": _feature("pixels", lambda n: np.full((n, 3), 1e300), is_depth=True),
     "a picture without pixels": lambda state: state["camera"].update(width_px=0),
     "a picture of 60000 pixels": lambda state: state["camera"].update(width_px=60_000, height_px=60_000),
     "a lens that is none": lambda state: state["camera"].update(focal_px=float("nan")),
@@ -260,7 +240,7 @@ NO_ROBOT_WRITES = {
     "a covariance that is none": _odometry("cov_rot_trans", _packed_array(-np.eye(6))),
     "a skew covariance": _odometry("cov_rot_trans", _packed_array(np.triu(np.ones((6, 6))))),
     "stamps that fall": _odometry("stamp_ns", 1),
-    "fewer depths than features": _depths(lambda n: np.zeros((n - 1, 3))),
+    "fewer depths than features": _feature("pixels", lambda n: np.zeros((n - 1, 3)), is_depth=True),
     "features with images": lambda state: _first_query(state)["features"].update(
         is_tried=_packed_array(np.ones(3, bool))
     ),
@@ -282,12 +262,11 @@ NO_ROBOT_WRITES = {
     "an array of terabytes": lambda state: state.update(body_from_cam=["<f8", [1 << 40, 4], b"x"]),
     "no frames": lambda state: state.update(frames=[]),
 }
-SAID = {
+FOREIGN = "an older format", "no camera", "an array of objects", "an array of terabytes", "no frames"
+SAID = dict.fromkeys(FOREIGN, "another fleetmap") | {
     "a view before the first": "-1 of a rig of 1 cameras",
     "a view of another rig": "1 of a rig of 1 cameras",
-} | dict.fromkeys(
-    ("an older format", "no camera", "an array of objects", "an array of terabytes", "no frames"), "another fleetmap"
-)
+}
 
 
 @pytest.mark.parametrize("what", NO_ROBOT_WRITES)

@@ -1,6 +1,7 @@
 """`locclient replay`: wrong orders end with 2, bad input with 3, each with what to do next, and before any work."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,6 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.geometry import se3
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from locclient.localization.priors.given import parse_prior
 from locclient.maps.map_client import MapClient
@@ -18,6 +18,7 @@ from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc, write_mcap
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.worlds import robot_world
+from support.worlds.building import strange
 
 Said = pytest.CaptureFixture[str]
 
@@ -85,10 +86,7 @@ def test_bad_input_ends_with_3(
         ([walk, "--site", "draft-only", "--store", store], "draft-only"),
         ([walk, "--site", "elsewhere", "--store", store], "elsewhere"),
         ([walk, "--site", "lab", "--store", store, "--calibration", tmp_path / "calibration.yaml"], "calibration.yaml"),
-        (
-            [walk, "--site", "lab", "--server", "tcp/127.0.0.1:1", "--cache", tmp_path / "cache"],
-            "is the server running",
-        ),
+        ([walk, "--site", "lab", "--server", "tcp/127.0.0.1:1", "--cache", tmp_path], "is the server running"),
     ):
         assert status("locclient", "replay", *arguments) == 3, arguments
         told = capsys.readouterr()
@@ -137,9 +135,7 @@ def test_files_that_cannot_be_written_are_told_before_the_work(
 
 def test_a_robot_of_another_building_says_so_and_ends_with_6(tmp_path: Path, capsys: Said) -> None:
     ride, report = robot_world.write(tmp_path / "ride", robot_world.bundles(120)), tmp_path / "report.json"
-    store = tmp_path / "store"
-    with MapStore.open(store, create=True) as maps:
-        robot_world.save(maps, of=tuple(replace(tile, descriptors=~tile.descriptors) for tile in robot_world.tiles()))
+    store = robot_world.stored(tmp_path / "store", of=strange(robot_world.tiles()))
     assert status("locclient", "replay", ride, "--store", store, "--site", "room", "--report", report) == 6
     words = "nothing in the map agrees with the pictures"
     assert words in capsys.readouterr().err
@@ -151,9 +147,7 @@ def test_a_robot_of_another_building_says_so_and_ends_with_6(tmp_path: Path, cap
 
 def test_frames_that_cannot_be_decoded_are_left_out(tmp_path: Path, capsys: Said) -> None:
     """The Huffman tables of JPEG files are destroyed, which no reader notices before decoding."""
-    store, report = tmp_path / "store", tmp_path / "report.json"
-    with MapStore.open(store, create=True) as maps:
-        robot_world.save(maps)
+    store, report = robot_world.stored(tmp_path / "store"), tmp_path / "report.json"
     walk = write_euroc(tmp_path / "walk", make_sample(3), image_type="jpg")
     files = sorted((walk / "mav0/cam0/data").iterdir())
     for number, count in ((1, 1), (0, 2)):
@@ -163,30 +157,25 @@ def test_frames_that_cannot_be_decoded_are_left_out(tmp_path: Path, capsys: Said
         files[number].write_bytes(data)
         ended = status("locclient", "replay", walk, "--site", "room", "--store", store, "--report", report)
         told = capsys.readouterr()
-        if count < 2:
-            assert ended == 0, told.err
+        assert ended == (0 if count == 1 else 3), told.err
+        if count == 1:
             (note,) = (note for note in json.loads(report.read_text())["notes"] if "left out" in note)
             assert note.startswith(f"{count} of 3 frames are left out; the first: {files[number]}")
-        else:
-            assert ended == 3
-            assert "2 of 3 frames cannot be read; the first: " in told.err
-            assert "image0.jpg: " in told.err
+    assert re.search("2 of 3 frames cannot be read; the first: .*image0.jpg: ", told.err)
 
 
 def test_a_rig_whose_covered_front_is_faster_than_its_rear_is_replayed(tmp_path: Path) -> None:
     """Frames in which the followed view has no image are left out."""
-    known, turned = calibration(), se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    front = tuple(replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in known.cameras)
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        robot_world.save(maps)
-    with McapRecordingWriter(tmp_path / "rig.mcap", replace(known, cameras=(*front, *known.cameras))) as writer:
+    known, report = calibration(), tmp_path / "report.json"
+    rig = replace(known, cameras=robot_world.turned(known.cameras) + known.cameras)
+    with McapRecordingWriter(tmp_path / "rig.mcap", rig) as writer:
         for number, bundle in enumerate(robot_world.bundles(50)):
             dark = np.zeros_like(bundle.frame.left)
             seen = replace(bundle.frame, left=dark, right=dark, others=(None if number % 2 else bundle.frame,))
             writer.write_imu(bundle.imu)
             writer.write_frame(seen)
-    arguments = "--site", "room", "--store", tmp_path / "store", "--report", tmp_path / "report.json"
+    arguments = "--site", "room", "--store", robot_world.stored(tmp_path / "store"), "--report", report
     assert status("locclient", "replay", tmp_path / "rig.mcap", *arguments) == 0
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert 20 <= report["frames"] <= 30
-    assert report["localised_share_of_all"] > 0.5
+    found = json.loads(report.read_text())
+    assert 20 <= found["frames"] <= 30
+    assert found["localised_share_of_all"] > 0.5

@@ -11,6 +11,5 @@ from support.worlds import robot_world
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        robot_world.save(maps)
+    with MapStore.open(robot_world.stored(tmp_path / "store")) as maps:
         yield maps

@@ -16,12 +16,9 @@ GOOD, DARK = GOOD_IMAGE, ImageQuality(Cause.DARK, 0.01, 0.0)
 def play(
     monitor: FailureMonitor, begin_s: float, end_s: float, image: ImageQuality = GOOD, **about: object
 ) -> list[Failure]:
-    told = []
-    for stamp_s in np.arange(begin_s, end_s - 1e-9, 0.1):
-        failure = monitor.handle(replace(estimate(float(stamp_s), **about), cause=image.cause, image=image))  # type: ignore[arg-type]
-        if failure is not None:
-            told.append(failure)
-    return told
+    moments = (estimate(float(stamp_s), **about) for stamp_s in np.arange(begin_s, end_s - 1e-9, 0.1))  # type: ignore[arg-type]
+    told = [monitor.handle(replace(moment, cause=image.cause, image=image)) for moment in moments]
+    return [failure for failure in told if failure is not None]
 
 
 def test_blindness_is_told_after_two_seconds_and_once() -> None:

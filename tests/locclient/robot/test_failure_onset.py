@@ -16,13 +16,13 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.image_quality import ImageQuality
-from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.failure_onset import Evidence, OnsetRecorder, refined_cause
 from locclient.robot.failure_report import RobotProfile, failure_report
-from locclient.robot.robot import FailureContext
+from locclient.robot.robot import Robot
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
 from support.worlds import robot_world
+from support.worlds.building import strange
 
 BLIND, NOT_FOUND = FailureKind.BLIND, FailureKind.NOT_FOUND
 
@@ -85,13 +85,10 @@ def test_the_belief_is_that_of_the_beginning() -> None:
 def test_a_robot_found_elsewhere_was_carried_where_its_tracks_broke(breaks: bool) -> None:
     recorder = OnsetRecorder()
     played(recorder, [estimate(0.1 * n, fix=True) for n in range(30)])
-    moved = se3(np.eye(3), np.array([5.0, 0.0, 0.0]))
-    elsewhere = [
-        replace(estimate(0.1 * n, Status.AMBIGUOUS, known=False), hypotheses=(Hypothesis(moved, 3),))
-        for n in range(30, 60)
-    ]
-    played(recorder, [broken(elsewhere[0]) if breaks else elsewhere[0], *elsewhere[1:]], begun_s=3.5)
-    now = elsewhere[-1]
+    places = (Hypothesis(se3(np.eye(3), np.array([5.0, 0.0, 0.0])), 3),)
+    first, *rest = (replace(estimate(0.1 * n, Status.AMBIGUOUS, known=False), hypotheses=places) for n in range(30, 60))
+    played(recorder, [broken(first) if breaks else first, *rest], begun_s=3.5)
+    now = rest[-1]
     evidence = recorder.evidence(now, BLIND, 3_500_000_000, now.odometry.odom_from_body)
     assert evidence.wrong_by_m == pytest.approx(5.0)
     cause = refined_cause(Cause.AMBIGUOUS, evidence)
@@ -129,26 +126,16 @@ def test_causes_by_their_evidence(cause: Cause, evidence: Evidence, refined: Cau
     assert refined_cause(cause, evidence) is refined
 
 
-def reported(
-    bundles: Iterable[SensorBundle], whole: LoadedMap, other: LoadedMap | None = None, at: int = -1
-) -> list[FailureReport]:
-    """other: the map from frame `at` on."""
-    robot, rig, contexts = robot_world.new_robot(), robot_world.rectifier(), list[FailureContext]()
-    robot.use(whole)
-    for number, bundle in enumerate(bundles):
-        if other is not None and number == at:
-            robot.use(other)
-        outcome = robot.handle(bundle)
-        if outcome is not None and outcome.failure is not None:
-            contexts.append(outcome.failure)
-    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS, "full")
-    return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
+def reported(robot: Robot, bundles: Iterable[SensorBundle]) -> list[FailureReport]:
+    contexts = [outcome.failure for outcome in map(robot.handle, bundles)]
+    profile = RobotProfile("room", "r1", robot_world.rectifier().rig, robot_world.SETTINGS, "full")
+    return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts if context]
 
 
 def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: MapStore) -> None:
     """Put down 2.4 m away while it stood: the pose and radius of that moment, pictures from before it, and the error."""
     at = 75
-    (report,) = reported(robot_world.carried(110, at), robot_world.loaded(store))
+    (report,) = reported(robot_world.new_robot(store), robot_world.carried(110, at))
     assert report.cause == "carried"
     assert report.wrong_by_m == pytest.approx(2.4, abs=0.1)
     np.testing.assert_allclose(report.map_from_base.position_m, robot_world.truth(74)[:3, 3], atol=0.1)
@@ -166,11 +153,9 @@ def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: Ma
 def test_a_changed_map_is_named(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every landmark's surroundings look otherwise from some frame on; odometry and images are sound."""
     monkeypatch.setattr(failure_definition, "FIND_DRIVING_S", 1.5)  # twenty would be three times this room's cycle
-    whole, rng = robot_world.loaded(store), np.random.default_rng(1)
-    changed = {
-        cell: replace(tile, descriptors=rng.integers(0, 256, tile.descriptors.shape, np.uint8))
-        for cell, tile in whole.tiles.items()
-    }
-    (report,) = reported(robot_world.bundles(110), whole, replace(whole, tiles=changed), 62)
+    robot, bundles = robot_world.new_robot(store), list(robot_world.bundles(110))
+    assert not reported(robot, bundles[:62])
+    robot.use(robot_world.loaded(store, strange(robot_world.tiles())))
+    (report,) = reported(robot, bundles[62:])
     assert report.cause == "map_changed"
     assert report.landmarks_expected > 10 * report.landmarks_seen

@@ -75,19 +75,14 @@ def test_pictures_are_small() -> None:
 
 def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures from before and from that moment."""
-    robot, told = robot_world.new_robot(), []
-    robot.use(robot_world.loaded(store))
-    for bundle in robot_world.bundles(130, dark=range(60, 130)):
-        outcome = robot.handle(bundle)
-        if outcome is not None and outcome.failure is not None:
-            told.append(outcome.failure)
-    assert len(told) == 1
-    assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
+    ride = robot_world.bundles(130, dark=range(60, 130))
+    (told,) = filter(None, (outcome.failure for outcome in map(robot_world.new_robot(store).handle, ride)))
+    assert told.failure.estimate.cause is told.failure.estimate.image.cause is told.failure.cause
     rig = robot_world.rectifier()
     base_from_body = se3(so3_exp(np.array([0.0, 0.1, 0.4])), np.array([0.2, -0.1, 0.5]))
     mounting = replace(rig.calibration, base_from_body=base_from_body)
     profile = RobotProfile("room", "r1", rig.rig._replace(calibration=mounting), robot_world.SETTINGS)
-    report = failure_report(told[0], profile, report_id="ab" * 16, wall_ns=7)
+    report = failure_report(told, profile, report_id="ab" * 16, wall_ns=7)
     assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
     assert report.status in {"DEGRADED", "LOST"}
     assert report.tile in {(-1, 0), (0, 0)}
@@ -103,10 +98,10 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert len(encode_message(report)) - len(encode_message(msgspec.structs.replace(report, evidence=None))) <= 200
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
     map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
-    np.testing.assert_allclose(map_from_cam, told[0].onset.belief.map_from_body @ rig.body_from_cam, atol=1e-9)
-    belief = told[0].onset.belief._replace(floor="hall-2")
-    onset = told[0].onset._replace(belief=belief)
-    other = failure_report(told[0]._replace(onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
+    np.testing.assert_allclose(map_from_cam, told.onset.belief.map_from_body @ rig.body_from_cam, atol=1e-9)
+    belief = told.onset.belief._replace(floor="hall-2")
+    onset = told.onset._replace(belief=belief)
+    other = failure_report(told._replace(onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
     assert (other.map_from_base, other.tile, other.landmarks_expected) == (None, None, None), "no place on this site"
     assert report.camera.size_px == (rig.camera.width_px, rig.camera.height_px)
     lens = rig.camera.cx_px, rig.camera.cy_px, rig.camera.focal_px
@@ -114,7 +109,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     assert len(encode_message(report.camera)) < 256
     assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
     left = frame(60).left
-    bright = told[0]._replace(unmatched=told[0].unmatched._replace(left=left))
+    bright = told._replace(unmatched=told.unmatched._replace(left=left))
     sharp, blurred = (
         failure_report(bright, profile._replace(pictures=seen), report_id="ab" * 16, wall_ns=7).thumbnails
         for seen in ("full", "blurred")

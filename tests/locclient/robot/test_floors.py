@@ -1,6 +1,5 @@
 """A robot in a building of several floors: it wakes up on any of them, and names those between which it cannot tell."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,11 +19,15 @@ from support.worlds import robot_world
 from support.worlds.building import SITES, house, strange
 
 
+def floors_of(folder: Path, site: str = "low") -> BuildingMaps:
+    floors = BuildingMaps(LocalMapSource(folder, site), lambda other: LocalMapSource(folder, other))
+    floors.refresh()
+    return floors
+
+
 def robot_of(store: MapStore, site: str = "low", *, missing: bool = False) -> Robot:
     source = LocalMapSource(store.folder, site)
-    floors, robot = BuildingMaps(source, lambda other: LocalMapSource(store.folder, other)), robot_world.new_robot()
-    floors.refresh()
-    change = floors.changes.popleft()
+    change, robot = floors_of(store.folder, site).changes.popleft(), robot_world.new_robot()
     tiles, _ = source.tiles(source.manifest(source.newest()))
     robot.use(replace(robot_world.loaded(store, site=site), tiles=tiles))
     robot.use_building(change.building, [] if missing else change.maps)
@@ -32,58 +35,45 @@ def robot_of(store: MapStore, site: str = "low", *, missing: bool = False) -> Ro
 
 
 def drive(robot: Robot, frames: int = 50) -> list[Estimate]:
-    outcomes = (robot.handle(bundle) for bundle in robot_world.bundles(frames))
-    return [outcome.estimate for outcome in outcomes if outcome is not None]
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
-    return tmp_path / "store"
+    return [outcome.estimate for outcome in map(robot.handle, robot_world.bundles(frames))]
 
 
 @pytest.mark.parametrize("own", SITES)
-def test_it_wakes_up_on_any_floor(folder: Path, own: str) -> None:
-    with house(folder, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0) as store:
+def test_it_wakes_up_on_any_floor(tmp_path: Path, own: str) -> None:
+    with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0) as store:
         robot = robot_of(store, own)
         estimates = drive(robot)
-        manifest = robot.running.manifest if robot.running else None
     assert estimates[-1].status is Status.TRACKING
     assert {e.floor for e in estimates if e.status is Status.TRACKING} == {"" if own == "high" else "high"}
     assert np.linalg.norm((estimates[-1].map_from_body - robot_world.truth(49))[:3, 3]) < 0.05, "in that floor's map"
-    assert manifest.site == "high"
+    assert robot.running.manifest.site == "high"
     assert robot._building_from_map()[:3, 3].tolist() == [3.0, 0.0, 4.0]  # type: ignore[index]
 
 
-def test_floors_that_are_the_same_are_both_named(folder: Path) -> None:
-    with house(folder, robot_world.tiles(), robot_world.tiles(), x_m=3.0) as store:
+def test_floors_that_are_the_same_are_both_named(tmp_path: Path) -> None:
+    with house(tmp_path, robot_world.tiles(), robot_world.tiles(), x_m=3.0) as store:
         estimates = drive(robot_of(store), frames=22)
     assert not [e for e in estimates if e.map_from_body is not None]
     assert estimates[-1].status is Status.AMBIGUOUS
     assert {h.floor for h in estimates[-1].hypotheses} == {"", "high"}
 
 
-def test_a_floor_whose_map_is_missing_is_where_it_may_be(folder: Path) -> None:
+def test_a_floor_whose_map_is_missing_is_where_it_may_be(tmp_path: Path) -> None:
     """Its map may look the same; a robot does not take its own floor for it."""
-    with house(folder, robot_world.tiles(), strange(robot_world.tiles())) as store:
+    with house(tmp_path, robot_world.tiles(), strange(robot_world.tiles())) as store:
         robot = robot_of(store, missing=True)
         assert not [e for e in drive(robot, frames=30) if e.status is Status.TRACKING]
         assert drive(robot_of(store))[-1].status is Status.TRACKING
 
 
-def test_a_site_without_a_building_is_as_before(folder: Path) -> None:
-    with MapStore.open(folder, create=True) as store:
-        robot_world.save(store, site="low")
-        source = LocalMapSource(folder, "low")
-        floors = BuildingMaps(source, lambda other: LocalMapSource(folder, other))
-        floors.refresh()
-        assert not floors.changes
+def test_a_site_without_a_building_is_as_before(tmp_path: Path) -> None:
+    assert not floors_of(robot_world.stored(tmp_path, site="low")).changes
 
 
-def test_changes_of_floors_reach_the_robot_once(folder: Path) -> None:
+def test_changes_of_floors_reach_the_robot_once(tmp_path: Path) -> None:
     lift = geojson({"name": "a", "box": (1.0, 1.0, 3.0, 3.0), "lift": "A"})
-    with house(folder, robot_world.tiles(), robot_world.tiles()) as store:
-        floors = BuildingMaps(LocalMapSource(folder, "low"), lambda other: LocalMapSource(folder, other))
-        floors.refresh()
+    with house(tmp_path, robot_world.tiles(), robot_world.tiles()) as store:
+        floors = floors_of(tmp_path)
         floors.refresh()
         assert [len(change.maps) for change in floors.changes] == [1]
         keep_areas(store, "high", lift, "", NOBODY)
@@ -98,8 +88,8 @@ def test_changes_of_floors_reach_the_robot_once(folder: Path) -> None:
         assert floors.changes[-1].building == {}
 
 
-def test_a_robot_that_visits_a_floor_reports_no_pose_on_its_own(folder: Path) -> None:
-    with house(folder, strange(robot_world.tiles()), robot_world.tiles()) as store:
+def test_a_robot_that_visits_a_floor_reports_no_pose_on_its_own(tmp_path: Path) -> None:
+    with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles()) as store:
         robot = robot_of(store)
         outcomes = [robot.handle(bundle) for bundle in robot_world.bundles(50)]
     last = outcomes[-1]

@@ -17,7 +17,6 @@ from locclient.robot.robot import Outcome
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
-from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 FIGURES = """speed_mps radius_95_m frame_ms_mean first_fix_s fix_innovation fix_innovation_m dock_error_m landmarks_expected
@@ -72,16 +71,12 @@ def test_who_says_that_he_is_lost_is_wrong_where_he_is_found_elsewhere_alone(
 
 def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:
     """A drive through the room; at its end a dock stands 0.2 m from where it says."""
-    robot, bundles, figures = robot_world.new_robot(), list(robot_world.bundles(62)), HealthFigures()
-    robot.use(robot_world.loaded(store))
-    for number, bundle in enumerate(bundles):
-        if number == 60:
-            map_from_base = robot_world.truth(number) @ se3_inverse(calibration().base_from_body)
-            map_from_base[0, 3] += 0.2
-            said = PositionPrior(bundle.frame.stamp_ns, map_from_base, 1e-4 * np.eye(6))
-            bundles[number] = replace(bundle, priors=[said])
-        outcome = robot.handle(bundles[number])
-        assert outcome is not None
+    robot, bundles, figures = robot_world.new_robot(store), list(robot_world.bundles(62)), HealthFigures()
+    map_from_base = robot_world.truth(60) @ se3_inverse(robot.base_from_body)
+    map_from_base[0, 3] += 0.2
+    said = PositionPrior(bundles[60].frame.stamp_ns, map_from_base, 1e-4 * np.eye(6))
+    bundles[60] = replace(bundles[60], priors=[said])
+    for outcome in map(robot.handle, bundles):
         figures.handle(outcome)
     metrics = figures.report("hall", "r1", 5, {}, False).metrics
     assert all(metrics.get(name) is not None for name in FIGURES.split())
@@ -97,9 +92,7 @@ def test_the_server_counts_what_a_robot_tells() -> None:
         handle(figures, said, 0.5 if number == 25 else None)
         if number % 10 == 0 or number == 49:
             health = figures.report(robot_world.SITE, "r1", said.stamp_ns, {}, silent=False)
-            added = watch.take_health(health)
-            assert added is not None
-            sums.append(added)
+            sums.append(watch.take_health(health))
     assert (sum(s.docks for s in sums), sum(s.docks_wrong for s in sums), sum(s.jumps for s in sums)) == (1, 1, 1)
     assert sum(s.landmarks_expected for s in sums) == 49 * 50, "since the first report"
     assert sum(s.landmarks_seen for s in sums) == 49 * 40
@@ -119,23 +112,10 @@ def test_a_rig_says_which_of_its_views_are_in_use_and_why_others_are_not(
 
 
 LOST, TRACKING, AMBIGUOUS = Status.LOST, Status.TRACKING, Status.AMBIGUOUS
-MAPPED, COVERED = (
-    {"map_version": 3},
-    {"map_version": 3, "cause": Cause.OCCLUDED, "image": replace(GOOD_IMAGE, cause=Cause.OCCLUDED)},
-)
-Part = tuple[
-    int, Status, float | None, dict[str, object], bool
-]  # frames of 0.1 s, status, speed, the estimate, whether the map may cover
-
-
-def drive(*parts: Part) -> HealthFigures:
-    figures, number = HealthFigures(), 0
-    for count, status, speed_mps, fields, may_be_mapped in parts:
-        for _ in range(count):
-            said: Estimate = replace(estimate(0.1 * number, status), **fields)
-            handle(figures, said, None, speed_mps, may_be_mapped)
-            number += 1
-    return figures
+MAPPED: dict[str, Any] = {"map_version": 3}
+COVERED = MAPPED | {"cause": Cause.OCCLUDED, "image": replace(GOOD_IMAGE, cause=Cause.OCCLUDED)}
+# Frames of 0.1 s, status, speed, the estimate, whether the map may cover.
+Part = tuple[int, Status, float | None, dict[str, Any], bool]
 
 
 @pytest.mark.parametrize(
@@ -159,7 +139,9 @@ def drive(*parts: Part) -> HealthFigures:
 def test_how_far_it_drove_without_finding_itself(
     parts: list[Part], words: str, flags: set[str], is_lost_run: bool
 ) -> None:
-    figures = drive(*parts)
+    figures, moments = HealthFigures(), [moment for count, *moment in parts for _ in range(count)]
+    for number, (status, speed_mps, fields, may_be_mapped) in enumerate(moments):
+        handle(figures, replace(estimate(0.1 * number, status), **fields), None, speed_mps, may_be_mapped)
     assert words in figures.search.words
     assert bool(words) == bool(figures.search.words)
     assert figures.search.is_lost_run is is_lost_run

@@ -6,36 +6,36 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import rotation_angle_rad, se3, se3_inverse, so3_exp
+from fleetmap.geometry import rotation_angle_rad, se3, so3_exp
 from fleetmap.messages import Cause, Flag, Status
 from fleetmap.odometry.estimate import OdometryStatus
-from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate
 from locclient.robot.motion_checks import DockCheck, SpeedGauge, WheelAgreement, imu_refused
-from locclient.robot.robot import Outcome, Robot
+from locclient.robot.robot import Outcome
 from mapserver.store import MapStore
 from support.fleet.estimates import estimate
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 
-def speeds(
-    gauge: SpeedGauge, mps: float, *, frames: int = 40, wheel: bool = False, **about: object
-) -> list[float | None]:
+def rolling(stamp_ns: int, mps: float) -> WheelSample:
+    return WheelSample(stamp_ns, np.array([mps, 0.0, 0.0]), 0.0, 0.01, 0.01)
+
+
+def speeds(mps: float, *, wheel: bool = False, **about: object) -> list[float | None]:
     """Frames at 10 Hz of a robot at a speed along x."""
+    gauge = SpeedGauge()
     found = []
-    for n in range(frames):
+    for n in range(40):
         odometry = replace(estimate(0.1 * n).odometry, **about)  # type: ignore[arg-type]
-        wheels = (
-            [WheelSample(odometry.stamp_ns, np.array([mps, 0.0, 0.0]), 0.0, 0.01, 0.01)] if wheel and n < 20 else []
-        )
+        wheels = [rolling(odometry.stamp_ns, mps)] * (wheel and n < 20)
         found.append(gauge.handle(wheels, odometry, se3(np.eye(3), np.array([0.1 * n * mps, 0.0, 0.0]))))
     return found
 
 
 def test_wheels_say_it_as_long_as_they_speak() -> None:
-    found = speeds(SpeedGauge(), 0.4, wheel=True, velocity_odom_mps=np.array([2.0, 0.0, 0.0]))
+    found = speeds(0.4, wheel=True, velocity_odom_mps=np.array([2.0, 0.0, 0.0]))
     assert found[:25] == pytest.approx([0.4] * 25)
     assert found[25:] == [2.0] * 15, "half a second after the last sample"
 
@@ -43,15 +43,15 @@ def test_wheels_say_it_as_long_as_they_speak() -> None:
 def test_without_an_imu_the_cameras_motion_says_it() -> None:
     """The odometry's velocity is then zero, however fast the robot is."""
     still = {"inertial": False, "velocity_odom_mps": np.zeros(3)}
-    assert speeds(SpeedGauge(), 0.7, **still)[6:] == pytest.approx([0.7] * 34)
-    assert speeds(SpeedGauge(), 0.0, **still)[6:] == pytest.approx([0.0] * 34)
-    assert speeds(SpeedGauge(), 0.7, **still)[:5] == [None] * 5
+    assert speeds(0.7, **still)[6:] == pytest.approx([0.7] * 34)
+    assert speeds(0.0, **still)[6:] == pytest.approx([0.0] * 34)
+    assert speeds(0.7, **still)[:5] == [None] * 5
 
 
 def test_what_nobody_knows_is_none() -> None:
     lost = {"inertial": False, "velocity_odom_mps": np.zeros(3)}
-    assert set(speeds(SpeedGauge(), 0.7, status=OdometryStatus.DEGRADED, **lost)) == {None}
-    assert set(speeds(SpeedGauge(), 0.7, scale_known=False)) == {None}
+    assert set(speeds(0.7, status=OdometryStatus.DEGRADED, **lost)) == {None}
+    assert set(speeds(0.7, scale_known=False)) == {None}
 
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.3, 0.0, 1.0]))
@@ -130,8 +130,7 @@ def drive(
     for n in range(first, first + round(metres / (0.1 * max(mps, wheel_mps)))):
         moved = se3(np.eye(3), np.array([0.1 * mps, 0.0, 0.0]))
         odometry = replace(estimate(0.1 * n).odometry, previous_from_body=moved, **changes)
-        wheel = WheelSample(odometry.stamp_ns, np.array([wheel_mps, 0.0, 0.0]), 0.0, 0.01, 0.01)
-        agreement.handle([wheel], odometry)
+        agreement.handle([rolling(odometry.stamp_ns, wheel_mps)], odometry)
     return agreement.is_refused
 
 
@@ -170,30 +169,23 @@ def test_an_imu_that_is_left_out_is_named_with_its_clock() -> None:
     assert "about 0.20 s early" in imu_refused(-0.198)["imu_refused"]
 
 
-TURNED = so3_exp(np.array([0.0, 0.0, np.pi]))
 FRAMES = 100
 
 
 def driven(store: MapStore, *, views: int = 1, imu: float | None = 1, wheels: float | None = 1) -> list[Outcome]:
     """Two laps of a robot in its map. imu, wheels: -1 for samples as of a body that looks back, None without them. views: 2 for a rig whose
     second pair looks back and shows nothing."""
-    rig = calibration()
-    rear = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in rig.cameras]
-    rig = replace(rig, cameras=(*rig.cameras, *rear[: 2 * views - 2]), imu=None if imu is None else rig.imu)
-    robot = Robot(Rectifier(rig), robot_world.SETTINGS, robot_world.TRIAL)
-    robot.use(robot_world.loaded(store))
-    outcomes = []
+    rig = calibration(has_imu=imu is not None)
+    robot = robot_world.new_robot(
+        store, replace(rig, cameras=(rig.cameras + robot_world.turned(rig.cameras))[: 2 * views])
+    )
+    outcomes, turn = [], np.array([imu or 1, imu or 1, 1])
     for number, bundle in enumerate(robot_world.bundles(FRAMES)):
-        moved = se3_inverse(robot_world.truth(max(number - 1, 0))) @ robot_world.truth(number)
-        stamp_ns, velocity_mps = bundle.frame.stamp_ns, moved[:3, 3] / robot_world.FRAME_S * (wheels or 0)
-        turn = TURNED if imu == -1 else np.eye(3)
-        samples = ImuSamples(bundle.imu.stamps_ns, bundle.imu.gyro_radps @ turn, bundle.imu.accel_mps2 @ turn)
-        wheel = WheelSample(stamp_ns, velocity_mps, float(moved[1, 0]) / robot_world.FRAME_S, 0.05, 0.05)
+        samples = ImuSamples(bundle.imu.stamps_ns, bundle.imu.gyro_radps * turn, bundle.imu.accel_mps2 * turn)
         frame = replace(bundle.frame, others=(None,) * (views - 1))
-        parts = {"imu": ImuSamples.empty() if imu is None else samples, "wheel": [] if wheels is None else [wheel]}
-        outcome = robot.handle(replace(bundle, frame=frame, **parts))
-        assert outcome is not None
-        outcomes.append(outcome)
+        wheel = [] if wheels is None else robot_world.rolled(number, frame.stamp_ns, wheels)
+        imu_samples = ImuSamples.empty() if imu is None else samples
+        outcomes.append(robot.handle(replace(bundle, frame=frame, imu=imu_samples, wheel=wheel)))
     return outcomes
 
 
@@ -242,12 +234,8 @@ def test_one_sensor_that_all_others_contradict_costs_itself(
 @pytest.mark.parametrize("is_left", [True, False])
 def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: MapStore, is_left: bool) -> None:
     """The rear pair sees the room upside down."""
-    front = calibration()
-    rear_cameras = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in front.cameras]
-    both = replace(front, cameras=(*front.cameras, *rear_cameras))
-    robot = Robot(Rectifier(both), robot_world.SETTINGS, robot_world.TRIAL)
-    robot.use(robot_world.loaded(store))
-    outcomes = []
+    rig, outcomes = calibration(), []
+    robot = robot_world.new_robot(store, replace(rig, cameras=rig.cameras + robot_world.turned(rig.cameras)))
     for bundle in robot_world.bundles(30):
         seen = bundle.frame
         left, right = (np.ascontiguousarray(image[::-1]) for image in (seen.left, seen.right))
@@ -261,8 +249,7 @@ def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: Map
 
 def test_while_a_gyro_contradicts_the_images_nobody_knows_which_of_them_is_right(store: MapStore) -> None:
     """Its sign is reversed in the middle of a turn: one frame may be the images' fault, two are DEGRADED at once."""
-    robot, outcomes = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL), []
-    robot.use(robot_world.loaded(store))
+    robot, outcomes = robot_world.new_robot(store), []
     for number, bundle in enumerate(robot_world.bundles(60)):
         sign = 1.0 if number < 35 else -1.0
         outcomes.append(robot.handle(replace(bundle, imu=replace(bundle.imu, gyro_radps=sign * bundle.imu.gyro_radps))))

@@ -5,48 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3_inverse, se3_log
 from fleetmap.messages import Flag, Status
-from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
-from locclient.robot.robot import Outcome, Robot
+from fleetmap.sensors.samples import CameraFrame, ImuSamples
+from locclient.robot.robot import Outcome
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
-from support.worlds.robot_world import SETTINGS, TRIAL
 
 FRAMES = 60
 
 
 def driven(store: MapStore, *, imu: bool, wheels: float, first: int = 0, frames: int = FRAMES) -> list[Outcome]:
     """What a robot tells of a ride to and fro, by the left camera and these sensors; wheels: factor on their speed, 0 for none."""
-    whole = calibration()
-    rig = replace(whole, cameras=whole.cameras[:1], imu=whole.imu if imu else None)
-    robot = Robot(Rectifier(rig), SETTINGS, TRIAL, lambda: 0.0)
-    robot.use(robot_world.loaded(store))
-    outcomes, last_ns = list[Outcome](), 0
+    rig = replace(calibration(has_imu=imu), cameras=calibration().cameras[:1])
+    robot, outcomes = robot_world.new_robot(store, rig), []
     for number, bundle in list(enumerate(robot_world.bundles(first + frames)))[first:]:
-        rolled = list[WheelSample]()
-        if wheels and last_ns:
-            moved = se3_log(
-                rig.base_from_body
-                @ se3_inverse(robot_world.truth(number - 1))
-                @ robot_world.truth(number)
-                @ se3_inverse(rig.base_from_body)
-            )
-            rate = wheels * moved / ((bundle.frame.stamp_ns - last_ns) * 1e-9)
-            stamps = np.linspace(last_ns, bundle.frame.stamp_ns, 6, dtype=np.int64)[1:]
-            rolled = [WheelSample(int(stamp_ns), rate[3:], float(rate[2]), 0.01, 0.01) for stamp_ns in stamps]
-        last_ns = bundle.frame.stamp_ns
-        alone = replace(
-            bundle,
-            frame=CameraFrame(last_ns, bundle.frame.left),
-            imu=bundle.imu if imu else ImuSamples.empty(),
-            wheel=rolled,
-        )
-        outcome = robot.handle(alone)
-        assert outcome is not None
-        outcomes.append(outcome)
+        alone = CameraFrame(bundle.frame.stamp_ns, bundle.frame.left)
+        wheel = robot_world.rolled(number, alone.stamp_ns, wheels) if wheels else []
+        samples = bundle.imu if imu else ImuSamples.empty()
+        outcomes.append(robot.handle(replace(bundle, frame=alone, imu=samples, wheel=wheel)))
     return outcomes
 
 

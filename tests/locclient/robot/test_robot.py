@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from fleetmap.free_memory import give_back_free_memory
-from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import Change
@@ -23,23 +24,21 @@ from support.worlds import robot_world
 LAPS, LAP_FRAMES = 20, 70
 
 
-def drive(robot: Robot, numbers: range, bundles: list) -> list[float]:  # type: ignore[type-arg]
+def off_m(estimate: Estimate, number: int) -> float:
+    return float(np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]))
+
+
+def drive(robot: Robot, bundles: list[SensorBundle], first: int = 0) -> list[float]:
     """Errors in metres of the tracked frames; all others are infinite."""
-    errors = []
-    for number in numbers:
-        estimate = robot.handle(bundles[number]).estimate
-        off = np.inf
-        if estimate.status is Status.TRACKING:
-            off = float(np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]))
-        errors.append(off)
-    return errors
+    estimates = [outcome.estimate for outcome in map(robot.handle, bundles)]
+    return [off_m(e, n) if e.status is Status.TRACKING else np.inf for n, e in enumerate(estimates, first)]
 
 
 def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) -> None:
     robot, bundles = robot_world.new_robot(), list(robot_world.bundles(70))
     assert robot.handle(bundles[0]).estimate.map_version is None
     robot.use(robot_world.loaded(store))
-    errors = drive(robot, range(1, 70), bundles)
+    errors = drive(robot, bundles[1:], 1)
     assert [change.change for change in robot.versions.changes] == [Change.ADOPTED]
     assert max(errors[45:]) < 0.05
 
@@ -49,16 +48,18 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
     frame = {"x_m": 3.0, "y_m": -4.0, "yaw_rad": 0.5}
     aligned = msgspec.structs.replace(loaded.manifest, configuration={"building": frame})
     found = []
+
+    def look() -> None:
+        found.append(robot.handle(next(robot_world.bundles(1))).published.building_from_map)
+
     for one in (loaded, replace(loaded, manifest=aligned), loaded):
         robot.use(one)
-        outcome = robot.handle(next(iter(robot_world.bundles(1))))
-        found.append(outcome.published.building_from_map)
+        look()
     assert found[0] is found[2] is None
     robot.use(replace(loaded, manifest=aligned))
     for frame_of_site in (BuildingFrame(x_m=9.0, y_m=8.0, yaw_rad=0.0), None):  # aligned anew, and that forgotten
         robot.use_building({}, [], frame_of_site)
-        outcome = robot.handle(next(iter(robot_world.bundles(1))))
-        found.append(outcome.published.building_from_map)
+        look()
     assert found[3][:2, 3].tolist() == [9.0, 8.0]
     np.testing.assert_array_equal(found[4], found[1])
     np.testing.assert_allclose(found[1], se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0])))
@@ -66,13 +67,12 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
 
 def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -> None:
     """Status: never wrong; after the trial TRACKING in the old version. Flag: refused, with both versions named."""
-    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(130))
-    robot.use(robot_world.loaded(store))
-    drive(robot, range(70), bundles)
+    robot, bundles = robot_world.new_robot(store), list(robot_world.bundles(130))
+    drive(robot, bundles[:70])
     slipped = robot_world.moved(np.array([2.0, 0.0, 0.0]))
     robot_world.save(store)
     robot.use(robot_world.loaded(store, of=slipped))
-    errors = drive(robot, range(70, 130), bundles)
+    errors = drive(robot, bundles[70:], 70)
     _, *changes = robot.versions.changes
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
     assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
@@ -82,13 +82,11 @@ def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -
 
 
 def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
-    robot = robot_world.new_robot()
-    bundles = list(robot_world.bundles(120, dark=range(71, 120)))
-    robot.use(robot_world.loaded(store))
-    drive(robot, range(70), bundles)
+    robot, bundles = robot_world.new_robot(store), list(robot_world.bundles(120, dark=range(71, 120)))
+    drive(robot, bundles[:70])
     robot_world.save(store)
     robot.use(robot_world.loaded(store))
-    drive(robot, range(70, 120), bundles)
+    drive(robot, bundles[70:])
     assert [change.change for change in robot.versions.changes] == [Change.ADOPTED, Change.POSTPONED]
     assert [held.version for held in robot.versions.held] == [1]
 
@@ -101,8 +99,7 @@ def test_laps_cost_no_memory(store: MapStore) -> None:
         give_back_free_memory()
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
-    robot, resident = robot_world.new_robot(), []
-    robot.use(robot_world.loaded(store))
+    robot, resident = robot_world.new_robot(store), []
     for number, bundle in enumerate(robot_world.bundles(LAPS * LAP_FRAMES)):
         robot.handle(bundle)
         robot.versions.changes.clear()
@@ -114,24 +111,20 @@ def test_laps_cost_no_memory(store: MapStore) -> None:
 FRAMES, GIVEN = 150, 60
 
 
+def prior(map_from_base: Array, sigma_m: float, *, is_revisable: bool = True) -> PositionPrior:
+    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, sigma_m**2, sigma_m**2, 0.25**2])
+    return PositionPrior(0, map_from_base, covariance, is_revisable)
+
+
 def ride(store: MapStore, off_m: float, *, is_revisable: bool = True) -> list[Estimate]:
     """The robot's ride; at frame GIVEN it is told a place off_m beside its own, with a sigma of half a metre."""
-    robot: Robot = robot_world.new_robot()
-    robot.use(robot_world.loaded(store))
+    robot, bundles = robot_world.new_robot(store), list(robot_world.bundles(FRAMES))
     told = robot_world.truth(GIVEN) @ se3_inverse(robot.base_from_body)
     told[0, 3] += off_m
-    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, 0.5**2, 0.5**2, 0.25**2])
-    estimates = []
-    for number, bundle in enumerate(robot_world.bundles(FRAMES)):
-        priors = [PositionPrior(0, told, covariance, is_revisable)] if number == GIVEN else []
-        outcome = robot.handle(replace(bundle, priors=priors))
-        estimates.append(outcome.estimate)
+    bundles[GIVEN] = replace(bundles[GIVEN], priors=[prior(told, 0.5, is_revisable=is_revisable)])
+    estimates = [outcome.estimate for outcome in map(robot.handle, bundles)]
     assert estimates[GIVEN - 1].status is Status.TRACKING
     return estimates
-
-
-def off_m(estimate: Estimate, number: int) -> float:
-    return float(np.linalg.norm(estimate.map_from_body[:2, 3] - robot_world.truth(number)[:2, 3]))
 
 
 @pytest.mark.parametrize(("off_m", "is_revisable"), [(0.3, True), (6.0, False)])
@@ -169,8 +162,7 @@ def test_who_may_be_within_a_tile_of_the_map_may_see_it(
     robot.use(loaded)
     last = max(loaded.manifest.tiles, key=lambda tile: tile.x)
     x_m, y_m = (last.x + 1) * robot_world.TILE_M + beside_m, (last.y + 0.5) * robot_world.TILE_M
-    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, sigma_m**2, sigma_m**2, 0.25**2])
-    told = PositionPrior(0, se3(np.eye(3), np.array([x_m, y_m, 0.0])), covariance, is_revisable=True)
+    told = prior(se3(np.eye(3), np.array([x_m, y_m, 0.0])), sigma_m)
     outcome = robot.handle(replace(next(iter(robot_world.bundles(1))), priors=[told]))
     assert outcome.may_be_mapped == is_covered
 
@@ -178,11 +170,9 @@ def test_who_may_be_within_a_tile_of_the_map_may_see_it(
 @pytest.mark.parametrize("forget", [False, True])
 def test_a_robot_that_forgets_claims_nothing_until_it_finds_itself(store: MapStore, forget: bool) -> None:
     """In the dark, where nothing can be found: what it claims there is what it remembers."""
-    robot, estimates = robot_world.new_robot(), []
-    robot.use(robot_world.loaded(store))
-    for number, bundle in enumerate(robot_world.bundles(FRAMES, dark=range(GIVEN, GIVEN + 5))):
-        outcome = robot.handle(replace(bundle, forget=forget and number == GIVEN))
-        estimates.append(outcome.estimate)
+    bundles = list(robot_world.bundles(FRAMES, dark=range(GIVEN, GIVEN + 5)))
+    bundles[GIVEN] = replace(bundles[GIVEN], forget=forget)
+    estimates = [outcome.estimate for outcome in map(robot_world.new_robot(store).handle, bundles)]
     assert all((one.map_from_body is None) == forget for one in estimates[GIVEN : GIVEN + 5])
     assert (estimates[GIVEN].status is Status.INITIALISING) == forget
     assert (estimates[-1].status, off_m(estimates[-1], FRAMES - 1) < 0.1) == (Status.TRACKING, True)

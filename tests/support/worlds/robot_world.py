@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,12 +12,13 @@ import numpy as np
 from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, se3, se3_inverse, se3_log
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
+from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from locclient.localization.settings import LocalizerSettings
@@ -110,6 +112,13 @@ def truth(number: int) -> Array:
     return cycle().world_from_body[number % len(cycle().world_from_body)]
 
 
+def rolled(number: int, stamp_ns: int, factor: float = 1.0) -> list[WheelSample]:
+    """The wheels on the way to a frame, fifty times a second; factor: on their speed."""
+    moved = factor / FRAME_S * se3_log(se3_inverse(truth(number - 1)) @ truth(number))
+    stamps_ns = range(stamp_ns - 80_000_000, stamp_ns + 1, 20_000_000)
+    return [WheelSample(each_ns, moved[3:], float(moved[2]), 0.02, 0.02) for each_ns in stamps_ns]
+
+
 @lru_cache(maxsize=1)
 def tiles() -> tuple[Tile, ...]:
     """The room's map: features of some frames, where their rays meet the walls."""
@@ -189,6 +198,13 @@ def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = Non
     return number
 
 
+def stored(folder: Path, **about: Any) -> Path:
+    """A store with a version of the room."""
+    with MapStore.open(folder, create=True) as store:
+        save(store, **about)
+    return folder
+
+
 def wanted(store: MapStore, site: str = SITE) -> WantedVersion:
     current = store.current(site)
     return WantedVersion(site=site, version=current.version, manifest_sha256=current.manifest_sha256)
@@ -209,5 +225,15 @@ def moved(offset_m: Array) -> tuple[Tile, ...]:
     )
 
 
-def new_robot(trial: TrialSettings = TRIAL) -> Robot:
-    return Robot(rectifier(), SETTINGS, trial)
+def turned(cameras: Iterable[CameraCalibration]) -> tuple[CameraCalibration, ...]:
+    """Cameras that look back."""
+    back = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    return tuple(replace(camera, body_from_cam=back @ camera.body_from_cam) for camera in cameras)
+
+
+def new_robot(store: MapStore | None = None, rig: RigCalibration | None = None, **about: Any) -> Robot:
+    """store: with its current version."""
+    robot = Robot(rectifier() if rig is None else Rectifier(rig), SETTINGS, TRIAL, **about)
+    if store is not None:
+        robot.use(loaded(store))
+    return robot
