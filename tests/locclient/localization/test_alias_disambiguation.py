@@ -83,10 +83,7 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, *others: Observ
 def test_signs_at_the_end_of_the_own_aisle_decide_alone(seed: int, signs: int, aisle: int | None, moved: bool) -> None:
     """Not a box that was moved there; and of two twins none is right where the own aisle is not in the map."""
     found = log_odds(*Aisles(seed, signs=signs).drive(aisle, moved=moved))
-    if signs and aisle is not None:
-        assert found > DECIDES
-    else:
-        assert abs(found) < ONE_BLOCK
+    assert found > DECIDES if signs and aisle is not None else abs(found) < ONE_BLOCK
 
 
 def test_signs_that_the_map_holds_in_one_aisle_only_say_nothing() -> None:
@@ -162,19 +159,14 @@ def plainly(one: ObservationHistory, other: ObservationHistory) -> float:
     blocks: dict[tuple[int, ...], Array] = {}
     for lattice, (cell_m, shift) in enumerate(alias_disambiguation._LATTICES):
         cells: list[dict[tuple[int, ...], list[Array]]] = [{}, {}]
-        for side, (history, alike) in enumerate(
-            zip((one, other), ({n for n, _ in pairs}, {m for _, m in pairs}), strict=True)
-        ):
-            for n in set(range(len(history.ids))) - alike:
+        for side, history in enumerate((one, other)):
+            for n in set(range(len(history.ids))) - {pair[side] for pair in pairs}:
                 cell = tuple(np.floor(history.points_odom[n] / cell_m + shift).astype(int).tolist())
                 looks = one.looks & other.looks
-                counts = (int(history.expected[n]) & looks).bit_count(), (int(history.found[n]) & looks).bit_count()
+                counts = [(int(kinds[n]) & looks).bit_count() for kinds in (history.expected, history.found)]
                 if not counts[0]:
                     continue
-                gone, often = (
-                    np.exp(log_beta_binomial(*counts, 0.5, 10.0)),
-                    np.exp(log_beta_binomial(*counts, 2.0, 2.8)),
-                )
+                gone, often = (np.exp(log_beta_binomial(*counts, *ab)) for ab in ((0.5, 10.0), (2.0, 2.8)))
                 cells[side].setdefault(cell, []).append(np.array([0.12 * gone + 0.88 * often, gone]))
         for cell in set(cells[0]) & set(cells[1]):
             (there, gone), (other_there, other_gone) = (np.prod(side[cell], axis=0) for side in cells)
@@ -216,9 +208,8 @@ def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
     for _ in range(8):
         one.begin_look()
         other.begin_look()
-        one.add(
-            np.eye(4), CovisibleLandmarks(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02)
-        )
+        found = rng.random(len(one.ids)) < 0.02
+        one.add(np.eye(4), CovisibleLandmarks(one.ids, one.points_odom, one.descriptors, found))
     assert log_odds(one, other) == pytest.approx(before, abs=1e-9)
 
 
@@ -227,10 +218,8 @@ def test_looks_are_counted_one_by_one() -> None:
     for number in range(6):
         history.begin_look()
         if number % 2 == 0:
-            ids = np.array([7, 3] if number < 4 else [9, 3], np.uint32)
-            seen = CovisibleLandmarks(
-                ids, np.full((2, 3), float(number)), np.zeros((2, 32), np.uint8), np.array([True, False])
-            )
+            ids, points = np.array([7, 3] if number < 4 else [9, 3], np.uint32), np.full((2, 3), float(number))
+            seen = CovisibleLandmarks(ids, points, np.zeros((2, 32), np.uint8), np.array([True, False]))
             history.add(np.eye(4), seen)
     assert history.ids.tolist() == [3, 7, 9]
     assert history.looks == 0b101010

@@ -22,9 +22,8 @@ def picture(number: int) -> Image:
 
 
 def frame(number: int, left: Image | None = None, right: Image | None = None) -> RectifiedFrame:
-    return RectifiedFrame(
-        number, picture(2 * number) if left is None else left, picture(2 * number + 1) if right is None else right, None
-    )
+    own = (picture(2 * number + side) if image is None else image for side, image in enumerate((left, right)))
+    return RectifiedFrame(number, *own, None)
 
 
 def judged() -> ImageQualityMonitor:

@@ -21,8 +21,8 @@ from support.fleet.scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
 
 
 @pytest.fixture
-def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
-    return Robot(monkeypatch).load()
+def robot() -> Robot:
+    return Robot().load()
 
 
 @pytest.fixture
@@ -39,8 +39,8 @@ def drift_until(robot: Robot, radius_m: float) -> None:
         pass
 
 
-def test_without_a_map_there_is_nothing_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimate = Robot(monkeypatch).go(0.1)
+def test_without_a_map_there_is_nothing_to_say() -> None:
+    estimate = Robot().go(0.1)
     assert estimate.status is Status.INITIALISING
     assert estimate.map_from_body is estimate.cov_rot_trans is estimate.map_version is estimate.fix is None
 
@@ -67,15 +67,12 @@ def test_what_tracking_takes(robot: Robot, step_m: float, inliers: int, alias_ra
 def test_fixes_that_do_not_agree_never_confirm(robot: Robot) -> None:
     """Each frame shows another place."""
     rng = np.random.default_rng(4)
-    for _ in range(30):
-        estimate = robot.go(0.4, [rng.uniform(-30, 30, 3)])
-        assert estimate.status is not Status.TRACKING
+    assert all(robot.go(0.4, [rng.uniform(-30, 30, 3)]).status is not Status.TRACKING for _ in range(30))
 
 
 def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
     robot.told(0.5)
-    estimate = robot.go(0.0)
-    assert robot.knows(estimate)
+    assert robot.knows(robot.go(0.0))
 
 
 @pytest.mark.parametrize(
@@ -124,8 +121,7 @@ def test_a_prior_is_no_longer_tight_after_some_way(robot: Robot) -> None:
     """Two metres without a fix: the next ones must be confirmed as anywhere else."""
     robot.told(0.5)
     robot.ride(6, 0.4, NO_FIX)
-    said = [e.status for e in robot.ride(4, 0.6)]
-    assert said == [Status.INITIALISING] * 2 + [Status.TRACKING] * 2
+    assert [e.status for e in robot.ride(4, 0.6)] == [I, I, T, T]
 
 
 def test_where_the_map_shows_nothing_a_dock_is_a_place_with_a_covariance(robot: Robot) -> None:
@@ -152,16 +148,13 @@ def test_a_kidnapped_robot_does_not_trust_the_dock_that_it_was_carried_from(trac
 
 def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:
     places = [off(0.0), off(0.0, 5.0)]
-    said = [robot.go(0.4, places) for _ in range(8)]
-    assert {e.status for e in said} == {Status.AMBIGUOUS}
-    last = said[-1]
-    assert last.map_from_body is None
-    assert last.fix is None
+    *said, last = robot.ride(8, 0.4, places)
+    assert {e.status for e in (*said, last)} == {Status.AMBIGUOUS}
+    assert last.map_from_body is last.fix is None
     assert "2 places" in last.refused
     found = sorted(float(np.linalg.norm(h.map_from_body[:3, 3] - robot.map_from_body[:3, 3])) for h in last.hypotheses)
     assert found == pytest.approx([0.0, 5.0], abs=1e-6)
-    after = [robot.go(0.4, places[:1]) for _ in range(10)]
-    assert robot.knows(after[-1])
+    assert robot.knows(robot.ride(10, 0.4, places[:1])[-1])
 
 
 def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
@@ -170,7 +163,6 @@ def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
         assert estimate.status is Status.TRACKING
         assert estimate.fix is None
         assert f"{metres:.2f} m off" in estimate.refused
-        assert estimate.innovation is not None
         assert estimate.innovation > TrackSettings().innovation_limit
         assert tracking.error_m(estimate) < 0.01
         assert tracking.go(0.2).fix is not None
@@ -250,7 +242,7 @@ def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> No
     tracking.map_from_body[:3, 3] += off(-1.0)
     after = tracking.ride(12, 0.25)
     assert after[-1].status is Status.TRACKING
-    assert all(estimate.moved_m is None for estimate in after)
+    assert not any(estimate.moved_m for estimate in after)
 
 
 def test_a_robot_that_is_lifted_knows_at_once_that_it_is_lost(tracking: Robot) -> None:
@@ -284,7 +276,7 @@ def test_a_robot_that_knew_no_place_was_not_carried_from_one(robot: Robot) -> No
 
 def test_lost_tracks_come_before_a_map_that_does_not_match(tracking: Robot) -> None:
     tracking.odometry.drift_share = 0.3
-    far = [tracking.go(0.5, NO_FIX) for _ in range(12)][-1]
+    far = tracking.ride(12, 0.5, NO_FIX)[-1]
     assert (far.status, far.cause) == (Status.LOST, Cause.UNMATCHED)
     tracking.odometry.breaks = True
     assert tracking.go(0.5, NO_FIX).cause is Cause.ODOMETRY
@@ -293,8 +285,7 @@ def test_lost_tracks_come_before_a_map_that_does_not_match(tracking: Robot) -> N
 def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:
     rng = np.random.default_rng(8)
     for number in range(12):
-        place = [rng.uniform(10, 40, 3)] if number % 4 else TRUE
-        estimate = tracking.go(0.05, place)
+        estimate = tracking.go(0.05, [rng.uniform(10, 40, 3)] if number % 4 else TRUE)
         assert estimate.status is Status.TRACKING
         assert tracking.error_m(estimate) < 0.01
 
@@ -302,10 +293,9 @@ def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:
 def test_without_fixes_tracking_ages_into_degraded(tracking: Robot) -> None:
     """Standing still, odometry without drift: only the age tells."""
     said = tracking.ride(12, 0.0, NO_FIX)
-    ages = [(k + 1) * FRAME_NS * 1e-9 for k in range(12)]
-    for age_s, estimate in zip(ages, said, strict=True):
-        expected = Status.DEGRADED if age_s > TrackSettings().degraded_after_s + 1e-9 else Status.TRACKING
-        assert estimate.status is expected
+    for number, estimate in enumerate(said, 1):
+        is_old = number * FRAME_NS * 1e-9 > TrackSettings().degraded_after_s + 1e-9
+        assert estimate.status is (Status.DEGRADED if is_old else Status.TRACKING)
         assert "nothing in the map" in estimate.refused
     assert tracking.go(0.0).status is Status.TRACKING
 
@@ -316,8 +306,7 @@ def test_drift_without_fixes_ends_lost_and_the_radius_says_so(tracking: Robot) -
     order = [Status.TRACKING, Status.DEGRADED, Status.LOST]
     ranks = [order.index(e.status) for e in said]
     assert ranks == sorted(ranks)
-    assert ranks[-1] == 2
-    assert 1 in ranks
+    assert {1, 2} <= {*ranks}
     radii = [radius_95_m(e.cov_rot_trans) for e in said]
     assert all(later > earlier for earlier, later in pairwise(radii))
     first_lost = ranks.index(2)
@@ -350,7 +339,7 @@ def test_a_pose_that_may_be_at_the_next_bay_is_confirmed_like_any_place(
 @pytest.mark.parametrize(("alias_step_m", "status"), [(2.5, Status.DEGRADED), (5.0, Status.TRACKING)])
 def test_the_map_says_how_near_a_look_alike_place_is(tracking: Robot, alias_step_m: float, status: Status) -> None:
     """A radius of 1.4 m includes a place 2.5 m away, and none 5 m away: then one weak fix within the gate is enough."""
-    tracking.load(2, alias_step_m=alias_step_m)
+    tracking.load(alias_step_m=alias_step_m, version=2)
     drift_until(tracking, 1.4)
     tracking.inliers, tracking.relocalizer.alias_ratio = 16, 0.9
     assert tracking.go(0.2, TRUE, 0.0).status is status
@@ -367,8 +356,7 @@ def test_a_doubted_pose_keeps_nobody_from_where_he_was_carried(tracking: Robot, 
 
 def test_odometry_that_redefines_its_frame_moves_nothing(tracking: Robot) -> None:
     tracking.odometry.redefine = se3(so3_exp(np.array([0.1, -0.2, 2.0])), np.array([4.0, 5.0, -1.0]))
-    estimate = tracking.go(0.2, NO_FIX)
-    assert tracking.error_m(estimate) < 1e-6
+    assert tracking.error_m(tracking.go(0.2, NO_FIX)) < 1e-6
 
 
 def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> None:
@@ -377,18 +365,18 @@ def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> N
     assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= UNKNOWN_ERROR.turn_rad
 
 
-def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer() -> None:
     """The first look is done at once, the others go on in the frame after, while the robot moves on; nothing is lost by that."""
-    robot = Robot(monkeypatch, fix_interval_s=0.6, settled_interval_s=0.6).load()
+    robot = Robot(fix_interval_s=0.6, settled_interval_s=0.6).load()
     robot.inliers = 100
     said = [robot.go(0.5, [off(0.0)]) for _ in range(11)]
     numbers = {(e.stamp_ns // FRAME_NS, e.fix_stamp_ns // FRAME_NS) for e in said if e.fix_stamp_ns is not None}
     assert numbers == {(1, 1), (5, 4), (8, 7), (11, 10)}
 
 
-def test_where_tracks_break_a_look_begins_and_the_one_before_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_tracks_break_a_look_begins_and_the_one_before_is_given_up() -> None:
     """At a frame that has no turn yet, and at one right after that of a look which is not done."""
-    robot = Robot(monkeypatch, fix_interval_s=0.6, settled_interval_s=0.6).load()
+    robot = Robot(fix_interval_s=0.6, settled_interval_s=0.6).load()
     robot.inliers, looks = 100, list[int]()
     for number in range(1, 13):
         robot.odometry.breaks = number in {6, 10}
@@ -398,11 +386,10 @@ def test_where_tracks_break_a_look_begins_and_the_one_before_is_given_up(monkeyp
     assert estimate.status is Status.TRACKING
 
 
-def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_look_that_took_two_frames_corrects_the_present() -> None:
     """The fixes are those of the frame that was looked at; the robot has turned and moved since."""
-    robot = Robot(monkeypatch, fix_interval_s=0.6).load()
-    said = [robot.go(0.4, turn_rad=0.2) for _ in range(30)]
-    assert robot.knows(said[-1])
+    robot = Robot(fix_interval_s=0.6).load()
+    assert robot.knows([robot.go(0.4, turn_rad=0.2) for _ in range(30)][-1])
 
 
 @pytest.mark.parametrize(
@@ -429,11 +416,9 @@ def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(trac
     """Believed: where it was found. Refused beside the prediction: how far. Refused elsewhere: it may be a twin, which says nothing."""
     tracking.go(0.4, [off(0.03)])
     near = tracking.go(0.4, [off(0.04)])
-    assert near.fix is not None
-    assert near.innovation_m == pytest.approx(0.04, abs=0.02)
+    assert (near.fix is not None, near.innovation_m) == (True, pytest.approx(0.04, abs=0.02))
     beside = tracking.go(0.4, [off(0.25)])
-    assert beside.fix is None
-    assert beside.innovation_m == pytest.approx(0.25, abs=0.05)
+    assert (beside.fix, beside.innovation_m) == (None, pytest.approx(0.25, abs=0.05))
     assert tracking.go(0.4, []).innovation_m is None
     for _ in range(TrackSettings().search_after_failed):
         elsewhere = tracking.go(0.4, [off(9.0)])

@@ -28,12 +28,16 @@ def odometry(frame: int) -> OdometryEstimate:
     return OdometryEstimate(frame, frame, *place, OdometryStatus.TRACKING, inertial=True, previous_from_body=STEP)
 
 
-def test_the_frame_of_a_long_search_moves_once_with_each_frame() -> None:
-    """Kept to be pooled with later ones while its own search goes on; the odometry drops it meanwhile."""
-    camera = MountedCamera(StereoCamera(500.0, 320.0, 240.0, 0.1, 640, 480), np.eye(4))
-    tracker = PoseTracker(LocalizerSettings(), [camera], np.eye(4), HeldMaps())
+def started(cameras: list[MountedCamera]) -> PoseTracker:
+    tracker = PoseTracker(LocalizerSettings(), cameras, np.eye(4), HeldMaps())
     tracker.propagate(odometry(0), {}, has_broken=False)
     tracker.confirmed = PoseHypothesis.at(odometry(0), Place(np.eye(4), 1e-6 * np.eye(6)))
+    return tracker
+
+
+def test_the_frame_of_a_long_search_moves_once_with_each_frame() -> None:
+    """Kept to be pooled with later ones while its own search goes on; the odometry drops it meanwhile."""
+    tracker = started([MountedCamera(StereoCamera(500.0, 320.0, 240.0, 0.1, 640, 480), np.eye(4))])
     tracker.begin_query(odometry(0))
     tracker.keep_frame(cast("FrameFeatures", None))
     motion = Motion(STEP, 1e-8 * np.eye(6), is_last=True)
@@ -53,9 +57,7 @@ def test_frames_of_a_single_or_depth_camera_count_beside_a_pair_by_their_bearing
     mounted = [MountedCamera(pair, np.eye(4)), MountedCamera(other, turned), MountedCamera(wide, turned)]
     seen = FrameFeatures(cast("orb.Features", None), np.array([[10.0, 20.0, 5.0], [30.0, 40.0, np.nan]]))
     for kept, queried, expected in ((1, 0, True), (0, 1, True), (2, 0, False)):
-        tracker = PoseTracker(LocalizerSettings(), mounted, np.eye(4), HeldMaps())
-        tracker.propagate(odometry(0), {}, has_broken=False)
-        tracker.confirmed = PoseHypothesis.at(odometry(0), Place(np.eye(4), 1e-6 * np.eye(6)))
+        tracker = started(mounted)
         tracker.begin_query(odometry(0), kept)
         tracker.keep_frame(seen)
         tracker.begin_query(odometry(0), queried)
@@ -186,12 +188,10 @@ def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
         (known.before(way), [at @ se3_inverse(since) for at, since in pairs]),
         (known.at_end_of(way), [at @ since for at, since in pairs]),
     ):
-        errors = np.array([boxminus(sample, mean) for sample in found])
         scale = np.sqrt(np.diag(claimed))
-        np.testing.assert_allclose(
-            np.cov(errors.T) / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.08
-        )
-        assert (np.abs(errors.mean(axis=0)) < 0.1 * scale).all()
+        errors = np.array([boxminus(sample, mean) for sample in found]) / scale
+        np.testing.assert_allclose(np.cov(errors.T), claimed / np.outer(scale, scale), atol=0.08)
+        assert (np.abs(errors.mean(axis=0)) < 0.1).all()
 
 
 def test_there_and_back_is_where_one_began() -> None:

@@ -131,7 +131,7 @@ class Seeing(Robot):
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch) -> Seeing:
     monkeypatch.setattr(CalibrationWatch, "handle", lambda *_: None)
-    return Seeing(monkeypatch, strong_inliers=100).load(alias_step_m=2.0)
+    return Seeing(strong_inliers=100).load(alias_step_m=2.0)
 
 
 def levels_m(robot: Seeing, steps: int, offset_m: float = 0.0) -> Array:
@@ -146,7 +146,7 @@ def test_a_dock_is_the_evidence_of_a_few_looks(robot: Seeing) -> None:
 
 
 def test_odometry_that_went_astray_within_its_covariance_ends_no_level(robot: Seeing) -> None:
-    robot.load(lookalikes=LookAlikes(0.0, 0.05, 0.0), alias_step_m=2.0)  # of a build that found nothing like its map
+    robot.load(LookAlikes(0.0, 0.05, 0.0), alias_step_m=2.0)  # of a build that found nothing like its map
     levels_m(robot, 12)
     robot.odometry.drift_share = 0.1
     robot.ride(8, 0.4, NO_FIX)

@@ -3,10 +3,10 @@ is, moved by the offsets that the script gives for that frame."""
 
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
+from unittest.mock import patch
 
 import numpy as np
-import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
@@ -116,9 +116,8 @@ def scripted_localizer(odometry: ScriptedOdometry, track: dict[str, Any], imu: I
 class Robot:
     """A localizer on a ride; `go` plays one frame."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **track: Any) -> None:
+    def __init__(self, **track: Any) -> None:
         self.relocalizer = ScriptedRelocalizer()
-        monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
         self.odometry = ScriptedOdometry()
         self.localizer = scripted_localizer(self.odometry, track)
         self.frames = 0
@@ -128,10 +127,9 @@ class Robot:
         self.rng = np.random.default_rng(0)
         self.map_from_body = MAP_FROM_ODOM.copy()
 
-    def load(
-        self, version: int = 1, lookalikes: LookAlikes | None = None, alias_step_m: float = ALIAS_STEP_M
-    ) -> "Robot":
-        self.localizer.handle_version(version, None, lookalikes, alias_step_m)  # type: ignore[arg-type]
+    def load(self, lookalikes: LookAlikes | None = None, alias_step_m: float = ALIAS_STEP_M, version: int = 1) -> Self:
+        with patch.object(module, "Relocalizer", lambda *_: self.relocalizer):
+            self.localizer.handle_version(version, None, lookalikes, alias_step_m)  # type: ignore[arg-type]
         return self
 
     def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:

@@ -3,9 +3,9 @@
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
-import pytest
 
 from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
@@ -15,7 +15,7 @@ from fleetmap.relocalization.map_view import ALIAS_STEP_M, CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import ImuSamples, WheelSample
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization import localizer as module
 from locclient.localization.estimate import Estimate
 from support.fleet.scripted_robot import BODY_FROM_CAM, ScriptedOdometry, first_near, scripted_localizer
@@ -67,12 +67,7 @@ class Relocalizer:
         return first_near(self._found(seen, SEEN_SHARE), map_from_cam, cov)
 
     def anywhere(
-        self,
-        seen: dict[str, list[Fix]],
-        near: object = None,
-        rotation: object = None,
-        found: Any = (),
-        failed: Any = None,
+        self, seen: dict[str, list[Fix]], near: object = None, _: object = None, found: Any = (), failed: Any = None
     ) -> Generator[None, None, list[Fix]]:
         yield
         new = self._found(seen, COMPARED_SHARE if near is not None and failed is None else SEEN_SHARE)
@@ -86,7 +81,6 @@ class LiftWorld:
     has_stock: pallets stand at the same places on every floor, with other goods; without, floors are equal.
     """
 
-    monkeypatch: pytest.MonkeyPatch
     floors: int
     likeness: float
     seed: int
@@ -102,7 +96,6 @@ class LiftWorld:
         self.rng = np.random.default_rng(self.seed)
         self.keys = ["", *(f"floor-{n}" for n in range(1, self.floors))]
         self.fixes: dict[str, list[Fix]] = {key: [] for key in self.keys}
-        self.monkeypatch.setattr(module, "Relocalizer", lambda floor, *_: Relocalizer(floor, self.fixes, self.rng))
         self.odometry = Odometry()
         self.localizer = scripted_localizer(self.odometry, self.track, NOISE if self.has_imu else None)
         # Each map has its own origin and heading in the building.
@@ -111,12 +104,12 @@ class LiftWorld:
         held = {}
         for n, (key, frame) in enumerate(zip(self.keys, frames, strict=True)):
             ring = (self.map_from_plan[n] @ np.c_[CABIN, np.zeros(4), np.ones(4)].T).T[:, :2]
-            held[key] = Floor(
-                FloorEntry(site=key or "own", level=f"L{n}", height_m=STOREY_M * n), frame, {"A": ((ring,),)}
-            )
+            entry = FloorEntry(site=key or "own", level=f"L{n}", height_m=STOREY_M * n)
+            held[key] = Floor(entry, frame, {"A": ((ring,),)})
         self.localizer.handle_building(held)
-        for key in self.keys:
-            self.localizer.handle_version(1, key, None, ALIAS_STEP_M, key)  # type: ignore[arg-type]
+        with patch.object(module, "Relocalizer", lambda floor, *_: Relocalizer(floor, self.fixes, self.rng)):
+            for key in self.keys:
+                self.localizer.handle_version(1, key, None, ALIAS_STEP_M, key)  # type: ignore[arg-type]
         self.plan_from_body = se3(np.eye(3), np.array([0.0, 0.0, 0.3]))
         pallets = [(x, y, 0.5) for x in (0.0, 2.0, 4.0, 6.0) for y in (-2.0, 2.0)]
         stock = np.concatenate([np.random.default_rng(5).uniform(0.0, 0.5, (12, 3)) + at for at in pallets])
@@ -146,17 +139,14 @@ class LiftWorld:
         stamps = now_ns - step_ns * np.arange(count)[::-1]
         noise = NOISE.accel_noise_mps2_rthz * np.sqrt(IMU_HZ)
         self._bias_mps2 += self.rng.normal(0.0, NOISE.accel_walk_mps3_rthz * np.sqrt(FRAME_S))
-        force = np.c_[np.zeros((count, 2)), np.full(count, 9.81 + self._bias_mps2)] + self.rng.normal(
-            0, noise, (count, 3)
-        )
+        force = np.array([0.0, 0.0, 9.81 + self._bias_mps2]) + self.rng.normal(0, noise, (count, 3))
         force += self.rng.normal(0.0, 0.3 if speed_mps else 0.02, (count, 3))
         if accel_mps2 is not None:
             force[:, 2] += accel_mps2
         if self.has_imu:
             self.localizer.handle_imu(ImuSamples(stamps, np.zeros((count, 3)), force))
-        self.localizer.handle_wheel(
-            [WheelSample(now_ns - 10_000_000, np.array([speed_mps, 0.0, 0.0]), 0.0, 0.02, 0.01)]
-        )
+        wheel = WheelSample(now_ns - 10_000_000, np.array([speed_mps, 0.0, 0.0]), 0.0, 0.02, 0.01)
+        self.localizer.handle_wheel([wheel])
         self.frames += 1
         self.driven_m += abs(speed_mps) * FRAME_S
         picture = self.rng.integers(0, 255, (480, 640), np.uint8)
@@ -170,9 +160,8 @@ class LiftWorld:
             self.fixes[key] = [self._fix(number, share)] if sees and share > 0 else []
 
     def _fix(self, number: int, share: float) -> Fix:
-        map_from_body = (
-            self.map_from_plan[number] @ self.plan_from_body @ se3(so3_exp(self.rng.normal(0, 0.001, 3)), np.zeros(3))
-        )
+        turn = se3(so3_exp(self.rng.normal(0, 0.001, 3)), np.zeros(3))
+        map_from_body = self.map_from_plan[number] @ self.plan_from_body @ turn
         map_from_body[:3, 3] += self.rng.normal(0.0, 0.01, 3)
         covariance = np.diag([0.002**2] * 3 + [0.01**2] * 3)
         inliers = max(1, round(share * self.rng.normal(60, 8)))
@@ -188,13 +177,18 @@ class LiftWorld:
         ids = np.flatnonzero(near).astype(np.uint32)
         return replace(fix, covisible=CovisibleLandmarks(ids, seen, self._looks[number][near], found))
 
-    def drive(self, metres: float, *, sees: bool = True) -> Iterator[Estimate]:
-        for _ in range(round(abs(metres) / (SPEED_MPS * FRAME_S))):
-            yield self.step(float(np.sign(metres)) * SPEED_MPS, sees=sees)
+    def told(self, sigma_m: float = 0.1, level: int | None = None, **about: Any) -> None:
+        """A prior at its place; level: in the map of another floor."""
+        place = self.map_from_plan[self.level if level is None else level] @ self.plan_from_body
+        covariance, stamp_ns = np.diag([0.02**2] * 3 + [sigma_m**2] * 3), int(self.frames * FRAME_S * 1e9) + 1
+        self.localizer.handle_prior(PositionPrior(stamp_ns, place, covariance, **about))
 
-    def stand(self, seconds: float, *, sees: bool = False) -> Iterator[Estimate]:
-        for _ in range(round(seconds / FRAME_S)):
-            yield self.step(0.0, sees=sees)
+    def drive(self, metres: float, *, sees: bool = True) -> list[Estimate]:
+        speed_mps = float(np.sign(metres)) * SPEED_MPS
+        return [self.step(speed_mps, sees=sees) for _ in range(round(abs(metres) / (SPEED_MPS * FRAME_S)))]
+
+    def stand(self, seconds: float, *, sees: bool = False) -> list[Estimate]:
+        return [self.step(0.0, sees=sees) for _ in range(round(seconds / FRAME_S))]
 
     def board(self) -> list[Estimate]:
         """Drive into the cabin, and wait there."""
@@ -207,13 +201,9 @@ class LiftWorld:
         """The cabin's ride to another floor; the doors are closed."""
         height_m = STOREY_M * (level - self.level)
         fastest_mps = min(fastest_mps, float(np.sqrt(abs(height_m) * accel_mps2)))
-        start, cruise = (
-            round(s * IMU_HZ)
-            for s in (fastest_mps / accel_mps2, abs(height_m) / fastest_mps - fastest_mps / accel_mps2)
-        )
-        pulse = np.sign(height_m) * accel_mps2 * np.ones(start)
-        accel = np.concatenate([pulse, np.zeros(cruise), -pulse])
-        count = round(IMU_HZ * FRAME_S)
+        start_s, count = fastest_mps / accel_mps2, round(IMU_HZ * FRAME_S)
+        pulse = np.full(round(start_s * IMU_HZ), np.sign(height_m) * accel_mps2)
+        accel = np.concatenate([pulse, np.zeros(round((abs(height_m) / fastest_mps - start_s) * IMU_HZ)), -pulse])
         accel = np.r_[accel, np.zeros(-len(accel) % count)]
         for part in accel.reshape(-1, count):
             yield self.step(0.0, part, sees=False)
@@ -242,17 +232,15 @@ class RideResult:
 
 def ride(world: LiftWorld, level: int, out_m: float = 8.0, **how: float) -> RideResult:
     """Drive into the lift, ride, and back out of it; the camera looks at the cabin's back wall until the robot has left it."""
-    result = RideResult()
-    wait_s = world.rng.uniform(1.5, 5.0)
-
-    list(world.drive(7.0))
-    list(world.drive(STAND_M - world.plan_from_body[0, 3], sees=False))
-    list(world.stand(wait_s))
+    result, wait_s = RideResult(), world.rng.uniform(1.5, 5.0)
+    world.drive(7.0)
+    world.drive(STAND_M - world.plan_from_body[0, 3], sees=False)
+    world.stand(wait_s)
     begun = world.frames
     for estimate in world.ride(level, **how):
         result.claimed_while_riding += world.frames - begun > 5 and estimate.map_from_body is not None
         result.floors_named |= {h.floor for h in estimate.hypotheses}
-    list(world.stand(2.0))
+    world.stand(2.0)
     opened, world.driven_m = world.frames, 0.0
     while world.driven_m < out_m:
         estimate = world.step(-SPEED_MPS, sees=world.plan_from_body[0, 3] < CABIN[0, 0])

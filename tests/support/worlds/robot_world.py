@@ -53,26 +53,18 @@ def rectifier() -> Rectifier:
 
 def bundles(frames: int, *, dark: range = range(0)) -> Iterator[SensorBundle]:
     """Frames with the IMU before each; those in `dark` are black."""
-    sample = cycle()
-    first_ns = int(sample.stamps_ns[0])
-    inside = (sample.imu_stamps_ns >= first_ns) & (sample.imu_stamps_ns < first_ns + CYCLE_NS)
-    stamps, gyro, accel = sample.imu_stamps_ns[inside], sample.gyro_radps[inside], sample.accel_mps2[inside]
-    fed_ns = first_ns
+    sample, first_ns = cycle(), int(cycle().stamps_ns[0])
+    once = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
     for number in range(frames):
         turn, index = divmod(number, len(sample.stamps_ns))
-        stamp_ns = int(sample.stamps_ns[index]) + turn * CYCLE_NS
-        until_ns = stamp_ns + 10_000_000
-        parts = []
-        for shift_ns in (turn * CYCLE_NS, (turn + 1) * CYCLE_NS):
-            chosen = (stamps + shift_ns >= fed_ns) & (stamps + shift_ns < until_ns)
-            parts.append((stamps[chosen] + shift_ns, gyro[chosen], accel[chosen]))
-        imu = ImuSamples(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-        fed_ns = until_ns
+        stamp_ns, shift_ns = int(sample.stamps_ns[index]), turn * CYCLE_NS
+        imu = once.between(max(first_ns, stamp_ns - 90_000_000), stamp_ns + 10_000_000)
+        imu = replace(imu, stamps_ns=imu.stamps_ns + shift_ns)
         rng = np.random.default_rng(number)  # a sensor's noise: a camera that repeats itself to the bit counts as stuck
         left, right = (_noisy(picture, rng) for picture in (sample.left[index], sample.right[index]))
         if number in dark:
             left, right = np.zeros_like(left), np.zeros_like(right)
-        yield SensorBundle(CameraFrame(stamp_ns, left, right), imu)
+        yield SensorBundle(CameraFrame(stamp_ns + shift_ns, left, right), imu)
 
 
 def carried(frames: int, at: int) -> Iterator[SensorBundle]:
@@ -135,32 +127,25 @@ def tiles() -> tuple[Tile, ...]:
 
 
 def _tile(cell: tuple[int, int], parts: list[tuple[Array, orb.Features, Array]]) -> Tile:
-    columns: dict[str, list[Array]] = {name: [] for name in ("ids", "points", "descriptors", "towards", "reach")}
-    places, seen_at, begin = [], [], 0
+    rows, places, seen_at, begin = [], [], [], 0
     for number, (map_from_cam, features, points) in enumerate(parts):
         ids = np.arange(begin, begin + len(points), dtype=np.uint32)
         begin += len(points)
         inside = (np.floor(points[:, :2] / TILE_M) == cell).all(axis=1)
         towards = map_from_cam[:3, 3] - points
         distance = np.linalg.norm(towards, axis=1)
-        for name, values in (
-            ("ids", ids),
-            ("points", points),
-            ("descriptors", features.descriptors),
-            ("towards", towards / distance[:, None]),
-            ("reach", distance * orb.SCALE_FACTOR ** features.octaves.astype(float)),
-        ):
-            columns[name].append(values[inside])
+        reach = distance * orb.SCALE_FACTOR ** features.octaves.astype(float)
+        columns = ids, points, features.descriptors, towards / distance[:, None], reach
+        rows.append([values[inside] for values in columns])
         if (np.floor(map_from_cam[:2, 3] / TILE_M) == cell).all():
             places.append((number, map_from_cam))
             seen_at.append(ids)
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    count = len(joined["ids"])
+    ids, points, descriptors, towards, reach = (np.concatenate(values) for values in zip(*rows, strict=True))
     return Tile(
-        tile_x=cell[0], tile_y=cell[1], size_m=TILE_M, landmark_ids=joined["ids"], points_map=joined["points"],
-        descriptors=joined["descriptors"], view_directions_map=joined["towards"].astype(np.float32),
-        view_half_angle_rad=np.full(count, 0.3, np.float32), max_distance_m=joined["reach"].astype(np.float32),
-        sigma_m=np.full(count, 0.01, np.float32), place_ids=np.array([n for n, _ in places], np.uint32),
+        tile_x=cell[0], tile_y=cell[1], size_m=TILE_M, landmark_ids=ids, points_map=points,
+        descriptors=descriptors, view_directions_map=towards.astype(np.float32),
+        view_half_angle_rad=np.full(len(ids), 0.3, np.float32), max_distance_m=reach.astype(np.float32),
+        sigma_m=np.full(len(ids), 0.01, np.float32), place_ids=np.array([n for n, _ in places], np.uint32),
         map_from_cam=np.array([m for _, m in places]).reshape(-1, 4, 4), place_landmark_ids=tuple(seen_at),
     )  # fmt: skip
 
