@@ -58,10 +58,8 @@ class Master:
         mqtt = pytest.importorskip("paho.mqtt.client")
         self.states: list[dict[str, Any]] = []
         self.connections: list[str] = []
-        self.factsheets: list[dict[str, Any]] = []
         self.visualizations: list[dict[str, Any]] = []
         self.faults: list[str] = []
-        self.retained: list[str] = []
         self.header_ids: dict[str, list[int]] = {}
         topics = ("state", "connection", "factsheet", "visualization", "instantActions")
         self._schemas = {topic: validator(topic, version) for topic in topics}
@@ -73,8 +71,7 @@ class Master:
         self._client.subscribe(f"{self.prefix}/#")
         self._client.loop_start()
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._speak_for_the_robot, daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._speak_for_the_robot, daemon=True).start()
 
     def close(self) -> None:
         self._stop.set()
@@ -95,11 +92,8 @@ class Master:
             self.states.append(content)
         elif topic == "connection":
             self.connections.append(content["connectionState"])
-            self.retained += [topic] * message.retain
         elif topic == "visualization":
             self.visualizations.append(content)
-        else:
-            self.factsheets.append(content)
 
     def _speak_for_the_robot(self) -> None:
         """The part of the state that is the robot's own program's."""
@@ -107,20 +101,20 @@ class Master:
             if self._robot_part is not None:
                 self.send("robotState", self._robot_part)
 
-    def begin_robot_part(self, **changed: Any) -> None:
+    def begin_robot_part(self) -> None:
         part = {
             "operatingMode": "AUTOMATIC",
             "powerSupply": {"stateOfCharge": 71.5, "charging": False},
             "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": False},
             "orderId": "o-1", "lastNodeId": "n-1", "driving": False, "loads": [],
-        } | changed  # fmt: skip
+        }  # fmt: skip
         self._robot_part = json.dumps(part).encode()
         self.send("robotState", self._robot_part)
 
-    def send(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        self._client.publish(f"{self.prefix}/{topic}", payload, retain=retain).wait_for_publish(5)
+    def send(self, topic: str, payload: bytes) -> None:
+        self._client.publish(f"{self.prefix}/{topic}", payload).wait_for_publish(5)
 
-    def act(self, action_type: str, *, is_valid: bool = True, **parameters: Any) -> str:
+    def act(self, action_type: str, **parameters: Any) -> str:
         """Sends an instant action and returns its id."""
         self._count += 1
         action = {
@@ -130,7 +124,7 @@ class Master:
         stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.") + "000Z"
         message = {"headerId": self._count, "timestamp": stamp, "version": self.version, "manufacturer": "acme"}
         message |= {"serialNumber": "0001", "actions": [action]}
-        assert self._schemas["instantActions"].is_valid(message) is is_valid
+        assert self._schemas["instantActions"].is_valid(message)
         self.send("instantActions", json.dumps(message).encode())
         return f"a-{self._count}"
 
@@ -140,8 +134,7 @@ class Master:
 
     def action(self, action_id: str) -> dict[str, Any]:
         states = self.state.get("instantActionStates" if self.version == "3.0.0" else "actionStates", [])
-        found = [state for state in states if state["actionId"] == action_id]
-        return found[0] if found else {"actionStatus": "UNSEEN"}
+        return next((state for state in states if state["actionId"] == action_id), {"actionStatus": "UNSEEN"})
 
     def done(self, action_id: str, status: str = "FINISHED", patience_s: float = PATIENCE_S) -> dict[str, Any]:
         """The state that first shows the action finished or failed."""
@@ -151,12 +144,8 @@ class Master:
 
     def seen(self, action_id: str) -> list[str]:
         """The statuses of an action in all states, each once."""
-        found: list[str] = []
-        for state in self.states:
-            for action in state["instantActionStates"]:
-                if action["actionId"] == action_id and action["actionStatus"] not in found:
-                    found.append(action["actionStatus"])
-        return found
+        actions = (action for state in self.states for action in state["instantActionStates"])
+        return list(dict.fromkeys(action["actionStatus"] for action in actions if action["actionId"] == action_id))
 
     def errors(self, error_type: str) -> list[dict[str, Any]]:
         return [error for error in self.state.get("errors", []) if error["errorType"] == error_type]

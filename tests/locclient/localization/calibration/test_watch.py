@@ -15,7 +15,8 @@ from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame
-from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
+from locclient.localization.calibration import monitor as monitor_module
+from locclient.localization.calibration.monitor import CalibrationMonitor, PairOrder, with_calibration
 from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
 from locclient.localization.calibration.watch import CalibrationWatch
 from locclient.localization.estimate import Estimate
@@ -37,9 +38,8 @@ def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: flo
     fix = Fix(level, np.diag([1e-6] * 3 + [1e-4] * 3), 120, 20, matched=replace(matched, points_source=points_map))
     fix = replace(fix, matches=np.column_stack([np.arange(120), np.arange(120)]))
     body = level[:3, :3] @ so3_exp(-(np.zeros(3) if turn is None else turn))
-    odometry = replace(
-        estimate(float(number)).odometry, odom_from_body=se3(body, np.zeros(3)), inertial=turn is not None
-    )
+    place = se3(body, np.zeros(3))
+    odometry = replace(estimate(float(number)).odometry, odom_from_body=place, inertial=turn is not None)
     view = SimpleNamespace(landmark_ids=ids, points_map=points_map)
     frame, relocalizer = RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), cast(Relocalizer, SimpleNamespace(view=view))
     return FinishedQuery(frame, odometry, cast(FrameFeatures, None), fix, relocalizer, is_confirmed=False)
@@ -53,12 +53,13 @@ def parameters(**sizes: float) -> Array:
 
 
 def after(
-    numbers: Iterable[int], wrong: Array, turn: Array | None = None, watch: CalibrationWatch | None = None
-) -> CalibrationWatch:
+    numbers: Iterable[int], wrong: Array, turn: Array | None = None, watch: CalibrationWatch | None = None, *,
+    is_confirmed: bool = False, yaw_rad: float = 0.2,
+) -> CalibrationWatch:  # fmt: skip
     """The watch, a new one by default, after these looks."""
     watch = watch or CalibrationWatch(RIG, StereoSettings())
     for number in numbers:
-        watch.handle(look(number, wrong, turn))
+        watch.handle(replace(look(number, wrong, turn, yaw_rad), is_confirmed=is_confirmed))
     return watch
 
 
@@ -68,9 +69,7 @@ def drifted(watch: CalibrationWatch) -> list[str]:
 
 def test_good_cameras_are_left_alone() -> None:
     watch = CalibrationWatch(RIG, StereoSettings())
-    for number in range(60):
-        watch.handle(look(number, parameters()))
-        assert not watch.state.is_wrong
+    assert not any(after([number], parameters(), watch=watch).state.is_wrong for number in range(60))
     assert watch.state.figures["calibration_focal_scale"] == pytest.approx(0.0, abs=0.005)
 
 
@@ -126,10 +125,8 @@ def test_turned_cameras_are_told_from_a_tilted_map() -> None:
 def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance(
     roll_deg: float, is_held: bool
 ) -> None:
-    watch = stood()
     turn = np.array([np.radians(roll_deg), 0.0, 0.0])
-    for number in range(25):
-        watch.handle(replace(look(number, parameters(), turn, yaw_rad=0.0), is_confirmed=True))
+    watch = after(range(25), parameters(), turn, stood(), is_confirmed=True, yaw_rad=0.0)
     assert not watch.state.is_wrong  # the map may be tilted as well
     assert (watch.state.cov_bias_cam is not None) == is_held
     if watch.state.cov_bias_cam is not None:
@@ -142,41 +139,31 @@ def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | No
     return with_calibration(judged, RIG, last_fix_ns, was_localized=True)
 
 
-def first_look(parameters: Array) -> FinishedQuery:
-    return replace(look(0, parameters), is_confirmed=True)
-
-
 def test_one_view_of_a_confirmed_pose_finds_what_is_large() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    watch.handle(look(0, parameters(focal=-0.05)))
+    wrong = parameters(focal=-0.05)
+    watch = after([0], wrong)
     assert not watch.state.drifts  # at a wrong place anything would show
-    watch.handle(first_look(parameters(focal=-0.05)))
-    assert drifted(watch) == ["focal_scale"]
-    alone = CalibrationWatch(RIG, StereoSettings())
-    alone.handle(first_look(parameters(focal=-0.05)))
-    assert drifted(alone) == ["focal_scale"]
+    for before in (watch, None):
+        assert drifted(after([0], wrong, watch=before, is_confirmed=True)) == ["focal_scale"]
 
 
 def test_what_one_view_does_not_exclude_is_held_by_the_covariance() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    watch.handle(first_look(parameters(focal=-0.012)))
+    watch = after([0], parameters(focal=-0.012), is_confirmed=True)
     assert not watch.state.is_wrong
     (focal,) = [drift for drift in watch.state.drifts if drift.parameter.figure == "focal_scale"]
     assert np.trace(watch.state.cov_bias_cam[3:, 3:]) > focal.bias_m**2 > 0.015**2
 
 
 def test_the_covariance_of_good_cameras_is_what_it_was_once_they_are_known() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    watch.handle(first_look(parameters()))
+    watch = after([0], parameters(), is_confirmed=True)
     for number in range(1, 40):
-        watch.handle(replace(look(number, parameters()), is_confirmed=True))
-        assert not watch.state.is_wrong
+        assert not after([number], parameters(), watch=watch, is_confirmed=True).state.is_wrong
     assert watch.state.cov_bias_cam is None
 
 
 def test_the_first_confirmed_pose_is_judged_before_it_is_published() -> None:
     monitor = CalibrationMonitor(RIG, RelocalizerSettings())
-    monitor.add(first_look(parameters(focal=-0.05)))
+    monitor.add(replace(look(0, parameters(focal=-0.05)), is_confirmed=True))
     tracking = estimate(0.0)
     assert published(monitor, tracking, tracking.stamp_ns).status is Status.DEGRADED
 
@@ -198,11 +185,8 @@ def test_a_wrong_calibration_is_published() -> None:
 
 
 def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
-    from locclient.localization.calibration import monitor as module
-    from locclient.localization.calibration.monitor import PairOrder
-
     said: list[Any] = [PairOrder.UNKNOWN, PairOrder.REVERSED]
-    monkeypatch.setattr(module, "pair_order", lambda *_: said.pop(0))
+    monkeypatch.setattr(monitor_module, "pair_order", lambda *_: said.pop(0))
     monitor = CalibrationMonitor(RIG, RelocalizerSettings())
     answers = [
         monitor.is_reversed(RectifiedFrame(stamp, NO_IMAGE, NO_IMAGE, None), is_localized=False)

@@ -23,15 +23,15 @@ BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 BASE_FROM_BODY = se3(np.eye(3), np.array([0.1, 0.0, 0.4]))
 AT = se3(np.eye(3), np.array([20.0, 8.0, 0.3]))  # map_from_body
 SIZE_M = 0.2
+NOWHERE = '{"position_m": [0, 0, 0], "quat_wxyz": [0, 0, 0, 0]}'
 
 
-def listed(*, moved_m: Array | None = None, sigma_m: float = 0.01) -> tuple[MarkerList, dict[int, Array]]:
+def listed(*, moved_m: Array | None = None) -> tuple[MarkerList, dict[int, Array]]:
     """Two markers before the robot, as listed and as they are; the first one moved from where it is listed."""
     there = {3: facing(np.array([22.2, 8.3, 0.9]), np.pi + 0.5), 4: facing(np.array([23.4, 7.2, 0.7]), np.pi - 0.3)}
     places = {number: Placement.of(at) for number, at in there.items()}
-    known = MarkerList(
-        markers=tuple(Marker(id=n, size_m=SIZE_M, map_from_marker=p, sigma_m=sigma_m) for n, p in places.items())
-    )
+    markers = (Marker(id=n, size_m=SIZE_M, map_from_marker=p, sigma_m=0.01) for n, p in places.items())
+    known = MarkerList(markers=tuple(markers))
     if moved_m is not None:
         there[3] = se3(np.eye(3), moved_m) @ there[3]
     return known, there
@@ -60,9 +60,8 @@ def test_a_marker_tells_the_place_within_its_covariance_and_once() -> None:
         (told,) = source.priors(frame(number, there))
         assert told.is_revisable and told.floor == ""
         assert is_within(told)
-        assert np.sqrt(np.linalg.eigvalsh(told.cov_rot_trans[3:5, 3:5])[-1]) < 0.6, (
-            "tight enough for one fix to confirm"
-        )
+        sigma_m = np.sqrt(np.linalg.eigvalsh(told.cov_rot_trans[3:5, 3:5])[-1])
+        assert sigma_m < 0.6, "tight enough for one fix to confirm"
         (other,) = source.priors(frame(number + 20, there))
         assert not np.allclose(other.map_from_base, told.map_from_base), "by the other marker"
         assert source.priors(frame(number + 40, there)) == [], "both have told it"
@@ -70,18 +69,16 @@ def test_a_marker_tells_the_place_within_its_covariance_and_once() -> None:
 
 def test_a_number_that_is_seen_twice_tells_nothing() -> None:
     known, there = listed()
-    twice = np.maximum(*(frame(0, {3: there[n]}).left for n in (3, 4)))
-    left = np.where(np.abs(twice - 120.0) > 30, twice, np.minimum(*(frame(0, {3: there[n]}).left for n in (3, 4))))
+    pictures = [frame(0, {3: there[n]}).left for n in (3, 4)]
+    twice = np.maximum(*pictures)
+    left = np.where(np.abs(twice - 120.0) > 30, twice, np.minimum(*pictures))
     assert priors_of(known).priors(RectifiedFrame(0, left.astype(np.uint8), None, None)) == []
 
 
 def test_a_moved_marker_is_named_until_it_agrees() -> None:
     known, there = listed(moved_m=np.array([0.0, 0.4, 0.0]))
     source = priors_of(known)
-    truth = replace(
-        estimate_at(0.0), status=Status.TRACKING, map_from_body=AT, cov_rot_trans=np.diag([1e-5] * 3 + [4e-4] * 3)
-    )
-    words = []
+    truth, words = replace(estimate_at(0.0, sigma_m=0.02), map_from_body=AT), []
     for number in range(6):
         source.priors(frame(number, there))
         words.append(source.judge(truth))
@@ -100,10 +97,7 @@ def test_a_moved_marker_is_named_until_it_agrees() -> None:
         ("[]", "no list of markers"),
         ('{"markers": [], "dictionary": "7X7"}', "unknown dictionary"),
         ('{"markers": [{"id": 1, "size_m": 0, "map_from_marker": {}}]}', "no list of markers"),
-        (
-            '{"markers": [{"id": 1, "size_m": 1, "map_from_marker": {"position_m": [0, 0, 0], "quat_wxyz": [0, 0, 0, 0]}}]}',
-            "unit quaternion",
-        ),
+        (f'{{"markers": [{{"id": 1, "size_m": 1, "map_from_marker": {NOWHERE}}}]}}', "unit quaternion"),
     ],
 )
 def test_a_wrong_list_is_refused(tmp_path: Path, text: str, words: str) -> None:

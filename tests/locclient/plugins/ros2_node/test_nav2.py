@@ -16,7 +16,6 @@ import pytest
 
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.recordings.ros2.messages import position_quat_xyzw
-from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.ros2.environment import needs_ros, ros_program
 from support.ros2.peer import BEST_EFFORT, LATCHED, PATIENCE_S, POSE, TF, RosPeer, ros_peer
@@ -37,8 +36,7 @@ def robot(
     """`locclient run` on a store's folder, with a ride that lasts."""
     path, walk = folder / f"{name}.toml", folder / f"walk{frames.start}"
     if not (folder / "store").exists():
-        with MapStore.open(folder / "store", create=True) as store:
-            robot_world.save(store, has_grid=True)
+        robot_world.stored(folder / "store", has_grid=True)
     if not walk.exists():
         robot_world.write(walk, islice(robot_world.bundles(frames.stop), frames.start, None))
     path.write_text(
@@ -206,14 +204,11 @@ def test_what_nodes_tell_of_their_map_of_a_building_of_a_stuck_robot_and_of_a_mi
             return eventually(lambda: len(peer.heard("/bond")) > count, within_s)
 
         assert is_bonded(PATIENCE_S)
-        process.stdin.write("stuck\n")
-        process.stdin.flush()
+        print("stuck", file=process.stdin, flush=True)
         assert soon(lambda: not is_bonded())
-        process.stdin.write("on\n")
-        process.stdin.flush()
+        print("on", file=process.stdin, flush=True)
         assert is_bonded(PATIENCE_S)
-        process.stdin.write("down\n")
-        process.stdin.flush()
+        print("down", file=process.stdin, flush=True)
         assert [line.split(":")[0] for line in process.stdout] == ["ROS 2 did not send"] * 2
         assert process.wait(PATIENCE_S) == 0
 

@@ -3,8 +3,8 @@
 import json
 import signal
 import subprocess
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,11 @@ from support.recordings.recording_samples import calibration
 from support.ros2.environment import needs_ros, ros_program
 from support.waiting import eventually
 
-
-@contextmanager
-def driver() -> Iterator[subprocess.Popen[str]]:
-    with ros_program("-m", "support.ros2.camera_driver") as process:
-        yield process
+driver = partial(ros_program, "-m", "support.ros2.camera_driver")
 
 
 def begin(camera: subprocess.Popen[str], **options: Any) -> None:
-    assert camera.stdin is not None and camera.stdout is not None
-    camera.stdin.write(json.dumps(options) + "\n")
-    camera.stdin.flush()
+    print(json.dumps(options), file=camera.stdin, flush=True)
     assert camera.stdout.readline() == "sending\n"
 
 

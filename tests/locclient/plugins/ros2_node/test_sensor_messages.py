@@ -30,6 +30,7 @@ from fleetmap.sources.intake import Intake
 from locclient.plugins.ros2_node.sensor_messages import RigFrames, SensorMessages
 from support.recordings.recording_samples import calibration
 from support.recordings.rig_samples import simulated
+from support.worlds.robot_world import turned
 
 TOPICS = Topics(left="/rig/left/image_raw", right="/rig/right/image_raw", imu="/rig/imu")
 LEFT = np.arange(48, dtype=np.uint8).reshape(6, 8)
@@ -92,16 +93,10 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
             put(sensors, queue, topic, encode_image(50, "cam0", image))
     assert all(TOPICS.right not in topics for topics, _, _ in sensors.topics)
     queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
-    found = queue.take(1.0).frame
-    assert isinstance(found, StoredFrame)
-    frame = decode_frame(found)
+    frame = decode_frame(queue.take(1.0).frame)  # type: ignore[arg-type]
     np.testing.assert_array_equal(frame.left, LEFT)
     assert frame.right is None
-    if has_depth:
-        assert frame.depth_m is not None
-        np.testing.assert_array_equal(frame.depth_m, depth_m)
-    else:
-        assert frame.depth_m is None
+    np.testing.assert_array_equal(frame.depth_m, depth_m if has_depth else None)
 
 
 PERIOD_NS, LATE_NS = 50_000_000, 3_000_000
@@ -109,9 +104,8 @@ IMAGE = grey_image(np.full((4, 4), 9, np.uint8))
 
 
 def rig() -> RigCalibration:
-    front, turned = calibration().cameras, se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
-    rear = (replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in front)
-    return RigCalibration((*front, *rear))
+    front = calibration().cameras
+    return RigCalibration(front + turned(front))
 
 
 def driven(
@@ -164,8 +158,7 @@ def test_a_front_that_never_sends_does_not_keep_the_rear_from_it() -> None:
 def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
     """Side cameras 3 and 6 ms after each other: a frame a period, with both, not two."""
     front, rear = rig().cameras[:2], rig().cameras[2]
-    turned = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
-    side = replace(rear, body_from_cam=turned @ rear.body_from_cam)
+    side = replace(rear, body_from_cam=se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3)) @ rear.body_from_cam)
     frames = RigFrames(RigCalibration((*front, rear, side)))
     driven(frames, range(3), later_ns=LATE_NS)
     done = driven(frames, range(3, 24), 2, 3, later_ns=LATE_NS)
@@ -212,12 +205,9 @@ def test_a_live_source_takes_the_depth_of_another_camera() -> None:
     sent = {topics.cam2: back.left, topics.cam2_depth: back.depth, topics.left: stored.left, topics.right: stored.right}
     for k in range(4):
         for topic, image in sent.items():
-            assert image is not None
             put(sensors, queue, topic, encode_image(stored.stamp_ns + k * PERIOD_NS, "cam", image))
-        frame = queue.take(1.0).frame
-        assert isinstance(frame, StoredFrame)
-        decoded.append(decode_frame(frame))
+        decoded.append(decode_frame(queue.take(1.0).frame))  # type: ignore[arg-type]
     for each in decoded:
         (other,) = each.others
-        assert other is not None and other.right is None and each.depth_m is None
+        assert other.right is each.depth_m is None
         np.testing.assert_array_equal(other.depth_m, frames[0].others[0].depth_m)

@@ -17,7 +17,6 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
-from fleetmap.sensors.samples import PositionPrior
 from locclient import hooks
 from locclient.hooks import LinkedRobot
 from locclient.plugins.vda5050.adapter import FleetAdapter
@@ -27,6 +26,7 @@ from locclient.plugins.vda5050.localization import Localization, Position
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
 from locclient.plugins.vda5050.settings import Vda5050Section, check_section
 from locclient.robot.continuous_odom import PublishedPose
+from locclient.robot.version_trial import Change, VersionChange
 from support.fleet.estimates import estimate
 from support.fleet_manager.vda5050_master import validator
 
@@ -44,11 +44,8 @@ PLACE = Position(1.0, 2.0, 3.14159265358979, 0.12)
 
 
 def seen(
-    status: Status = Status.TRACKING,
-    cause: Cause = Cause.NONE,
-    version: int | None = 1,
-    position: Position | None = PLACE,
-) -> Localization:
+    status: Status = Status.TRACKING, cause: Cause = Cause.NONE, *, version: int | None = 1, position: Position | None = PLACE
+) -> Localization:  # fmt: skip
     last = replace(estimate(1e-8, status, version=version), cause=cause)
     is_localized = status is Status.TRACKING and position is not None
     return Localization(last, position, is_localized, is_silent=False)
@@ -132,7 +129,7 @@ def test_a_robot_stops_above_its_alert_limit(level_m: float, is_localized: bool)
     placed = PublishedPose(np.eye(4), np.eye(4))
     localization = Localization().after(frame(placed, protection_m=level_m), 3.0, np.eye(4), stop_above_m=0.3)
     position = localization.mobile_robot_position("hall", 3.0)
-    assert position is not None and position["localized"] is is_localized
+    assert position["localized"] is is_localized
     assert (localization.error() is None) is is_localized
     assert position["localizationScore"] == pytest.approx(1 - level_m / 3 if is_localized else 0.0)
 
@@ -247,7 +244,7 @@ def test_the_robots_own_part_is_missed_and_checked() -> None:
         assert adapter.said()["operatingMode"] == "AUTOMATIC", "the last one stands"
     bent = {"errorType": "FORK_BENT", "errorLevel": "URGENT", "errorHint": None}
     optional = dict.fromkeys(
-        ("nodeStates", "actionStates", "orderId", "lastNodeId", "velocity", "loads", "information")
+        ["nodeStates", "actionStates", "orderId", "lastNodeId", "velocity", "loads", "information"]
     )
     adapter.robot_part(json.dumps({**PART, **optional, "errors": [bent]}).encode())
     assert adapter.error_types() == ["FORK_BENT"]
@@ -351,8 +348,6 @@ def test_a_new_order_ends_the_states_of_finished_actions_in_2_x(version: str, le
 
 
 def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
-    from locclient.robot.version_trial import Change, VersionChange
-
     adapter = Adapter()
     assert adapter.ask(name="a", mapId="hall", mapVersion="1")["actionStatus"] == "FINISHED", "it is enabled already"
     assert adapter.ask(name="b", mapId="hall", mapVersion="2")["actionStatus"] == "RUNNING"
@@ -360,9 +355,8 @@ def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
     (wanted,) = adapter.offers
     adapter._maps.held = [(1, False), (2, True)]
     adapter.changed_version(VersionChange(wanted, Change.ADOPTED))
-    assert [entry["mapStatus"] for entry in adapter.said()["maps"]] == ["DISABLED", "ENABLED"], (
-        "finished and enabled in one state"
-    )
+    statuses = [entry["mapStatus"] for entry in adapter.said()["maps"]]
+    assert statuses == ["DISABLED", "ENABLED"], "finished and enabled in one state"
     adapter._maps.held = [(1, True), (2, False)]
     adapter.work()
     adapter.changed_version(VersionChange(wanted, Change.REFUSED, "fixes contradict it"))
@@ -380,9 +374,8 @@ def test_a_position_is_reset_or_not() -> None:
     given = {"x": 4.0, "y": 4.0, "theta": 1.0, "mapId": "hall", "lastNodeId": "n-7"}
     adapter._see(seen(Status.LOST))
     assert adapter.ask("initializePosition", "a", **given)["actionStatus"] == "RUNNING"
-    prior: PositionPrior = adapter.priors[0]
-    assert prior.stamp_ns == 11
-    assert prior.map_from_base[:2, 3].tolist() == [4.0, 4.0]
+    (prior,) = adapter.priors
+    assert (prior.stamp_ns, prior.map_from_base[:2, 3].tolist()) == (11, [4.0, 4.0])
     adapter._see(seen(position=Position(4.2, 3.9, 1.1, 0.2)))
     adapter._judge_position()
     assert adapter.said()["instantActionStates"][0]["actionStatus"] == "FINISHED"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import LinkError, UsageError
 from locclient.plugins.vda5050.dialects import Dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, InstantActions, RobotPart, decode, timestamp
@@ -37,14 +37,8 @@ STATE: dict[str, Any] = {
 
 
 def headed(version: str, content: dict[str, Any]) -> dict[str, Any]:
-    head = {
-        "headerId": 1,
-        "timestamp": timestamp(10**18),
-        "version": version,
-        "manufacturer": "acme",
-        "serialNumber": "1",
-    }
-    return head | content
+    head = {"headerId": 1, "timestamp": timestamp(10**18), "version": version}
+    return head | {"manufacturer": "acme", "serialNumber": "1"} | content
 
 
 @pytest.mark.parametrize("version", OLD)
@@ -68,9 +62,8 @@ def test_a_state_of_any_content_fits(version: str) -> None:
 @pytest.mark.parametrize("stop", ["MANUAL", "REMOTE", "NONE"])
 def test_every_mode_of_a_robot_fits(mode: str, stop: str) -> None:
     content = STATE | {"operatingMode": mode, "safetyState": {"activeEmergencyStop": stop, "fieldViolation": False}}
-    decode(
-        json.dumps({key: content[key] for key in ("operatingMode", "safetyState", "powerSupply")}).encode(), RobotPart
-    )
+    part = {key: content[key] for key in ("operatingMode", "safetyState", "powerSupply")}
+    decode(json.dumps(part).encode(), RobotPart)
     for version in OLD:
         said = headed(version, Dialect(version).said("state", content))
         assert list(validator("state", version).iter_errors(said)) == []
@@ -99,10 +92,8 @@ def test_instant_actions_of_all_versions_are_understood() -> None:
         assert (heard.action_type, heard.action_id, heard.action_descriptor) == ("initializePosition", "a", "words")
         assert heard.action_parameters[0].key == "x"
         for optional in ("actionDescription", "actionParameters"):
-            (heard,) = decode(
-                Dialect(version).heard(json.dumps({"headerId": 1, "actions": [asked | {optional: None}]}).encode()),
-                InstantActions,
-            ).actions
+            message = {"headerId": 1, "actions": [asked | {optional: None}]}
+            (heard,) = decode(Dialect(version).heard(json.dumps(message).encode()), InstantActions).actions
             assert (heard.action_type, heard.action_id) == ("initializePosition", "a")
 
 
@@ -110,8 +101,6 @@ def test_instant_actions_of_all_versions_are_understood() -> None:
     "payload", [b"", b"[]", b"{", b"null", b"\xff", b"{}", b'{"actions": 3}', b'{"actions": [3]}', b"[" * 10_000]
 )
 def test_what_is_no_message_is_left_to_the_adapter(payload: bytes) -> None:
-    from fleetmap.errors import LinkError
-
     with pytest.raises(LinkError):
         decode(Dialect("2.1.0").heard(payload), InstantActions)
     with pytest.raises(LinkError, match="limit"):

@@ -1,10 +1,9 @@
 """Downloads that must not become maps of a robot, and the one that may."""
 
-import contextlib
 import hashlib
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
@@ -76,11 +75,10 @@ class Robot:
         self, kind: type[Exception], words: str, link: str, sha256: str | None = None, version: int = 1
     ) -> None:
         """The download fails, and leaves nothing behind."""
-        before, size = self.maps.versions(), self.cache.total_bytes
+        before = self.maps.versions(), self.cache.total_bytes
         with pytest.raises(kind, match=words):
             self.maps.download(version, link, sha256)
-        assert self.maps.versions() == before
-        assert self.cache.total_bytes == size
+        assert (self.maps.versions(), self.cache.total_bytes) == before
         assert list(self.folder.iterdir()) == []
 
 
@@ -93,16 +91,14 @@ def test_a_version_is_taken_kept_and_deleted(tmp_path: Path, file: bytes) -> Non
         robot.refuses(RefusedActionError, "on the robot already", f"{http}/file")
     again = Robot(tmp_path, http)
     assert again.maps.versions() == [(1, False)], "it survives a restart"
-    wanted = again.maps.wanted(1)
-    assert wanted == robot.asked[0]
+    assert again.maps.wanted(1) == robot.asked[0]
     again.fault = UntrustedError("rollback", "withdrawn")
     with pytest.raises(UntrustedError, match="withdrawn"):
         again.maps.wanted(1)
     with pytest.raises(StateError, match="in use"):
         again.maps.delete(1, {1})
     again.maps.delete(1, set())
-    assert again.maps.versions() == []
-    assert again.cache.total_bytes == 0
+    assert (again.maps.versions(), again.cache.total_bytes) == ([], 0)
     with pytest.raises(StateError, match="not on the robot, which has none"):
         again.maps.delete(1, set())
 
@@ -141,25 +137,15 @@ def test_links_lead_to_named_servers_alone(tmp_path: Path, file: bytes) -> None:
         robot = Robot(tmp_path, http)
         robot.refuses(LinkError, "points to", f"{other}/file")
         robot.refuses(LinkError, "answers 302", f"{http}/file")  # redirections are not followed
-        host = http.removeprefix("http://")
-        for link in (
-            f"http://{host}@{other.removeprefix('http://')}/file",
-            f"{http}.evil.example/file",
-            f"https://{host}/file",
-            "file:///etc/passwd",
-            f"{http}/fi\r\nHost: x",
-            "http://[::1/x",
-            "",
-        ):
+        host, rest = http.removeprefix("http://"), other.removeprefix("http://")
+        links = f"http://{host}@{rest}/file", f"{http}.evil.example/file", f"https://{host}/file"
+        for link in (*links, "file:///etc/passwd", f"{http}/fi\r\nHost: x", "http://[::1/x", ""):
             robot.refuses(LinkError, "link", link)
     assert asked == []
     with pytest.raises(LinkError, match="from nowhere"):
         Origins(()).admit("https://maps.example/file")
-    for origin, words in (
-        ("maps.example", "not like"),
-        ("https://maps.example/x", "not like"),
-        ("http://10.0.0.1", "TLS"),
-    ):
+    origins = {"maps.example": "not like", "https://maps.example/x": "not like", "http://10.0.0.1": "TLS"}
+    for origin, words in origins.items():
         with pytest.raises(UsageError, match=words):
             Origins((origin,)).check()
 
@@ -170,14 +156,12 @@ def test_bodies_and_heads_without_end_and_servers_that_hang_up(
     def endless(request: BaseHTTPRequestHandler) -> None:
         request.send_response(200)
         request.end_headers()
-        try:
+        with suppress(OSError):
             for _ in range(10_000):
                 request.wfile.write(b"\0" * 65536)
-        except OSError:
-            return
 
     def endless_head(request: BaseHTTPRequestHandler) -> None:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             while True:
                 request.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 

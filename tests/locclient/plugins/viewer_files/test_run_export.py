@@ -14,7 +14,6 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
 from fleetmap.plugins.viewer_channels.channels import CHANNELS
 from locclient.cli import app
-from mapserver.store import MapStore
 from support.worlds import robot_world
 
 FRAMES, CARRIED_AT = 110, 75
@@ -25,28 +24,21 @@ pytestmark = pytest.mark.timeout(600)
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A store with a map, and the recording of a robot that is put down 2.4 m away."""
     folder = tmp_path_factory.mktemp("room")
-    with MapStore.open(folder / "maps", create=True) as store:
-        robot_world.save(store)
-    return folder / "maps", robot_world.write(folder / "carried", robot_world.carried(FRAMES, CARRIED_AT))
-
-
-def truth(stamp_ns: int) -> Array:
-    """Where the robot was."""
-    stamps = [bundle.frame.stamp_ns for bundle in robot_world.bundles(FRAMES)]
-    return robot_world.truth(stamps.index(stamp_ns))
+    return robot_world.stored(folder / "maps"), robot_world.write(
+        folder / "carried", robot_world.carried(FRAMES, CARRIED_AT)
+    )
 
 
 def map_from_base(message: Any) -> Array | None:
     """From the message of `/tf`; None where the robot is not in the map."""
-    known = {
-        (link.parent_frame_id, link.child_frame_id): se3(
-            rotation_from_quat_wxyz(np.array([link.rotation.w, link.rotation.x, link.rotation.y, link.rotation.z])),
-            np.array([link.translation.x, link.translation.y, link.translation.z]),
+    known = {}
+    for link in message.transforms:
+        turn, place = (
+            [getattr(part, axis) for axis in "wxyz" if hasattr(part, axis)]
+            for part in (link.rotation, link.translation)
         )
-        for link in message.transforms
-    }
-    map_from_odom = known.get(("map", "odom"))
-    return None if map_from_odom is None else map_from_odom @ known["odom", "base_link"]
+        known[link.parent_frame_id, link.child_frame_id] = se3(rotation_from_quat_wxyz(np.array(turn)), np.array(place))
+    return known["map", "odom"] @ known["odom", "base_link"] if ("map", "odom") in known else None
 
 
 def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -> None:
@@ -63,12 +55,8 @@ def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -
     assert {"/map", "/tf", "/camera", "/camera/matches", "/fixes", "/robots", "/path", "/log"} <= in_file
     assert {"/failures/log", "/failures/place", "/failures/frame", "/failures/matches", "/failures/report"} <= in_file
     assert len(seen["/camera"]) == len(seen["/tf"]) == FRAMES
-    frames = {bundle.frame.stamp_ns: n for n, bundle in enumerate(robot_world.bundles(FRAMES))}
-    errors = [
-        np.linalg.norm(placed[:3, 3] - truth(stamp_ns)[:3, 3])
-        for stamp_ns, message in seen["/tf"].items()
-        if frames[stamp_ns] < CARRIED_AT and (placed := map_from_base(message)) is not None
-    ]
+    places = [(n, map_from_base(seen["/tf"][b.frame.stamp_ns])) for n, b in enumerate(robot_world.bundles(CARRIED_AT))]
+    errors = [np.linalg.norm((at - robot_world.truth(n))[:3, 3]) for n, at in places if at is not None]
     assert len(errors) > 50
     assert max(errors) < 0.1
     for stamp_ns, found in seen["/camera/matches"].items():
