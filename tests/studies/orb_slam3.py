@@ -109,7 +109,6 @@ def export_images(recording: Recording, frames: Iterable[int], folder: Path) -> 
 def measured(command: Sequence[str | Path]) -> tuple[float, float]:
     """CPU seconds and largest memory, in 10^6 bytes, of a command and its children; RuntimeError with its last words where it fails."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        assert process.stdout is not None
         words = process.stdout.read()
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -124,7 +123,6 @@ def ate_mm(world_from_left: Trajectory, recording: Recording, pairs: int) -> flo
     Of rectification's turn of the camera nothing is seen.
     """
     truth = recording.ground_truth
-    assert truth is not None
     true = Trajectory(truth.stamps_ns, truth.frame_from_body @ body_from_left(recording))
     found = absolute_trajectory_error(world_from_left, true, frames=pairs)
     return 1e3 * found.rmse_m if len(world_from_left) > 0.99 * pairs else float("inf")

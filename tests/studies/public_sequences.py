@@ -57,7 +57,6 @@ def survey(path: Path, same_rig: Path | None = None) -> Row:
             return {"survey": done.stderr.strip().splitlines()[-1]}
         with open_recording(path) as recording:
             truth, frames = recording.ground_truth, len(recording)
-        assert truth is not None
         found = absolute_trajectory_error(read_tum(out), truth, frames=frames)
         rigid = json.loads(report.read_text())
         tiles = tiles_of(store, "surveyed")
@@ -115,7 +114,6 @@ def case(name: str) -> Row:
             return row | {"map": f"no map of the even frames: status {error.returncode}"}
         with open_recording(path) as recording:
             truth = recording.ground_truth
-        assert truth is not None
         run = played(path, store, UNSEEN)
         return row | odometry(played(path, store), truth) | robots(run) | {"robot": hashed(run.estimates)["estimates"]}
 

@@ -133,9 +133,7 @@ def updated(number: int) -> Row:
         run_night(request, MapserverConfig().gate, Console(stderr=True))
     except FleetmapError as error:
         print(f"night {number}: {error}")
-    said = last_report(store, SITE)
-    assert said is not None
-    return said
+    return last_report(store, SITE)
 
 
 def landmarks() -> Row:

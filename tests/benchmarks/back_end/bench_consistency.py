@@ -1,9 +1,7 @@
 """Odometry over Monte-Carlo runs of the simulator without pictures: errors beside their covariance, and drift.
 
-`PYTHONPATH=tests python -m benchmarks.back_end.bench_consistency [--runs N] [--seed SEED] [--out FILE.json]`;
-about five minutes of one core
-for 100 runs of 17 s, 15 s of them driving. Seeds 1000 to 1099 and 5000 to 5099 served to choose settings, those from 6000 were
-looked at on the way; figures to report begin at 7000.
+About five minutes of one core for 100 runs of 17 s, 15 s of them driving. Seeds 1000 to 1099 and 5000 to 5099 served to choose settings,
+those from 6000 were looked at on the way; figures to report begin at 7000.
 """
 
 import numpy as np

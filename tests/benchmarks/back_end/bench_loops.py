@@ -1,10 +1,8 @@
 """Accepted loops of simulated surveys without pictures against the truth, in units of their covariance and of the gate's.
 
-    PYTHONPATH=tests python -m benchmarks.back_end.bench_loops [--seed 40100] [--loops 1500] [--out FILE.json]
-
 Surveys of many seeds until there are so many loops. A loop's error has six degrees of freedom: `beyond` counts those outside the ellipsoid
-that holds 0.9973 of a normal error, as three sigmas of one axis do; NEES is the squared error in sigmas by degree of freedom. The gate's
-is that of the pose graph's prediction before the loop, which loops are tested against.
+that holds 0.9973 of a normal error, as three sigmas of one axis do; NEES is the squared error in sigmas by degree of freedom. The gate's is
+that of the pose graph's prediction before the loop, which loops are tested against.
 """
 
 from collections.abc import Iterator

@@ -1,12 +1,10 @@
 """What the back end of a survey costs as its site grows: the fulfilment centre without pictures, its first so many keyframes.
 
-CPU seconds and peak memory by keyframes, the slopes of their growth (log-log fits), the error against the truth, and loops
-that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
-that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
+CPU seconds and peak memory by keyframes, the slopes of their growth (log-log fits), the error against the truth, and loops that are wrong.
+Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so that its cost, which
+goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    PYTHONPATH=tests python -m benchmarks.back_end.bench_site KEYFRAMES... [--frames N] [--work FOLDER] [--out FILE.json]
-
-The drive, of at most N frames at 7.5 Hz, stays in the work folder.
+The drive, of at most `--frames` frames at 7.5 Hz, stays in the work folder.
 """
 
 import time

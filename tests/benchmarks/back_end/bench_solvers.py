@@ -1,7 +1,6 @@
 """Solvers in one run: pose graphs with and without wrong loops; local and global bundle adjustment beside gtsam's.
 
-`PYTHONPATH=tests python -m benchmarks.back_end.bench_solvers [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
-hour. The reference problems lie beside the project, in `../shared/data`.
+Without `--only` a quarter of an hour. The reference problems lie beside the project, in `../shared/data`.
 """
 
 import time

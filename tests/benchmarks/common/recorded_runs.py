@@ -46,7 +46,7 @@ def benchmark(names: Iterable[str] = (), several: str = "", **numbers: int) -> C
             parser.add_argument(several, nargs="+")
         parser.add_argument("--only", action="append", choices=list(names))
         for name, default in numbers.items():
-            parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
+            parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default, help=f"{default} by default")
         parser.add_argument("--work", type=Path, default=kept_folder())
         parser.add_argument("--out", type=Path)
         options = parser.parse_args()
@@ -69,10 +69,9 @@ def kept_folder() -> Path:
     return Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization" / code.hexdigest()[:12]
 
 
-def resident_mb() -> dict[str, float]:
-    """10^6 bytes of this process in memory, and of those what is not mapped from disk."""
-    now = psutil.Process().memory_info()
-    return {"resident": now.rss / 1e6, "anonymous": (now.rss - now.shared) / 1e6}
+def resident_mb(pid: int | None = None) -> float:
+    """10^6 bytes of a process in memory, of this one by default."""
+    return psutil.Process(pid).memory_info().rss / 1e6
 
 
 def tool(name: str) -> list[str]:

@@ -51,7 +51,7 @@ def mean_of(seen: list[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def at_reference(milliseconds: float | None, seen: list[float | None]) -> float | None:
-    """Milliseconds as the reference would take; None where either is unknown."""
+def at_reference(taken: float | None, seen: list[float | None]) -> float | None:
+    """CPU time, in any unit, that the reference would take; None where either is unknown."""
     slow = mean_of(seen)
-    return None if milliseconds is None or slow is None else milliseconds / slow
+    return None if taken is None or slow is None else taken / slow

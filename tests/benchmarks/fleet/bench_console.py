@@ -1,13 +1,11 @@
 """The console in a real browser while robots report: first content, paints a second, memory of open pages, and the server's start.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_console [--robots 300] [--out FILE.json]
-
 Server, robots and browser share the machine: on two cores the browser's times are those of a busy machine. CPU of the start is also given
 by the yardstick.
 """
 
+import itertools
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,11 +14,12 @@ from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.common.recorded_runs import Options, Results, benchmark
-from benchmarks.common.yardstick import slowness
-from benchmarks.fleet.server_process import cpu_s, resident_mb
+from benchmarks.common.recorded_runs import Options, Results, benchmark, resident_mb
+from benchmarks.common.yardstick import at_reference, slowness
+from benchmarks.fleet.server_process import cpu_s
 from support.fleet.dashboard_scene import SITE, fill_store, serving, talking
 from support.pages.browser import Chromium
+from support.waiting import repeated
 
 _PAGES = ("", "trends", "map", "failures", "surveys")
 _LOOKS, _PAINTED_S, _SETTLE_S = 7, 5.0, 10.0
@@ -41,22 +40,15 @@ _FIRST = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?
 @contextmanager
 def driving(zenoh: str, robots: int) -> Iterator[None]:
     """Robots that report every second, and drive."""
-    over = threading.Event()
+    steps = itertools.count(1)
     with talking(zenoh, robots) as moved:
 
         def drive() -> None:
-            step = 0
-            while not over.wait(1.0):
-                step += 1
-                moved.update({f"tug-{n}": (5.0 + (n * 0.7 + step) % 50, 3.0 + n % 26) for n in range(robots)})
+            step = next(steps)
+            moved.update({f"tug-{n}": (5.0 + (n * 0.7 + step) % 50, 3.0 + n % 26) for n in range(robots)})
 
-        driver = threading.Thread(target=drive)
-        driver.start()
-        try:
+        with repeated(drive, 1.0):
             yield
-        finally:
-            over.set()
-            driver.join()
 
 
 def first_content_s(page: Page, address: str) -> float:
@@ -102,7 +94,4 @@ def main(asked: Options) -> Results:
         with serving(Path(folder)) as served:
             ready_s = cpu_s(served.process)
             figures = measure(served.http, served.zenoh, served.process, asked.robots)
-    figures["ready_cpu_s"] = ready_s
-    if slow is not None:
-        figures["ready_cpu_s_at_reference"] = ready_s / slow
-    return {f"{asked.robots} robots": figures}
+    return {f"{asked.robots} robots": figures | {"ready_cpu_s_at_reference": at_reference(ready_s, [slow])}}

@@ -1,14 +1,11 @@
-"""Enrolled robots: the bus of a thousand, and a revocation. `PYTHONPATH=tests python -m benchmarks.fleet.bench_enrolled [--out FILE]`."""
+"""Enrolled robots: the bus of a thousand, and a revocation."""
 
-import os
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.common.recorded_runs import Options, Results, benchmark
-from benchmarks.fleet.server_process import resident_mb
+from benchmarks.common.recorded_runs import Options, Results, benchmark, resident_mb
 from fleetmap.access import Holder
 from fleetmap.bus.endpoints import TlsFiles
 from fleetmap.bus.zenoh_bus import Bus
@@ -19,17 +16,14 @@ from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.storage.map_samples import save_sample_draft
+from support.waiting import eventually, repeated
 
 SITE, ENDPOINT = "lab", "tls/127.0.0.1:7447"
 
 
 def _until(condition: Callable[[], bool], within_s: float = 20.0) -> float:
     begun_s = time.perf_counter()
-    while not condition():
-        if time.perf_counter() - begun_s > within_s:
-            return float("nan")
-        time.sleep(0.01)
-    return time.perf_counter() - begun_s
+    return time.perf_counter() - begun_s if eventually(condition, within_s) else float("nan")
 
 
 def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, float]:
@@ -42,20 +36,12 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     names = [f"r{number}" for number in range(count)]
     register.enrol(SITE, names, ENDPOINT)
     holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
-    before_mb = resident_mb(os.getpid())
+    before_mb = resident_mb()
     bus = Bus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access())
     bus.queryable(robot_key("*", "*", "wanted"), lambda *_: b"1")
-    begun_s, cpu_s = time.perf_counter(), time.process_time()
+    begun_s = time.perf_counter()
     bus.open()
-    cpu_s = time.process_time() - cpu_s
-    found = {"open_s": time.perf_counter() - begun_s, "open_cpu_s": cpu_s, "mb": resident_mb(os.getpid()) - before_mb}
-    guard, is_over = BusGuard(register, bus), threading.Event()
-
-    def follow() -> None:
-        while not is_over.wait(1.0):  # as the server's background task
-            guard.follow()
-
-    threading.Thread(target=follow, daemon=True).start()
+    found = {"open_s": time.perf_counter() - begun_s, "mb": resident_mb() - before_mb}
     robots = []
     for holder in holders:
         own = folder / f"{holder.certificate}.pem"
@@ -68,12 +54,12 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
         except UnreachableError:
             return False
 
-    _until(lambda: all(answered(number) for number in range(connected)))
-    register.revoke(SITE, [holders[0].robot])
-    found["revoked_is_out_s"] = _until(lambda: not answered(0))
-    found["others_again_s"] = _until(lambda: all(answered(number) for number in range(1, connected)))
-    found["revoked_stays_out"] = float(not answered(0))
-    is_over.set()
+    with repeated(BusGuard(register, bus).follow, 1.0):  # as the server's background task
+        _until(lambda: all(answered(number) for number in range(connected)))
+        register.revoke(SITE, [holders[0].robot])
+        found["revoked_is_out_s"] = _until(lambda: not answered(0))
+        found["others_again_s"] = _until(lambda: all(answered(number) for number in range(1, connected)))
+        found["revoked_stays_out"] = float(not answered(0))
     for robot in robots:
         robot.close()
     bus.close()

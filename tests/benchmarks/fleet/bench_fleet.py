@@ -1,10 +1,8 @@
 """A fleet that reports: health at 1 Hz, estimates at 2 Hz and failures of many robots to one server on loopback, counted at both ends.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_fleet [--robots 300] [--seconds 120] [--out FILE.json]
-
 Robots have a zenoh session each and clocks that are wrong by seconds. Meanwhile lists and figures are asked for over HTTP. Every count is
-compared with what the robots know: reports, failures by site, robot, tile and cause, hours driven. A store is filled with 30 days of
-sums of so many robots, and its size is measured.
+compared with what the robots know: reports, failures by site, robot, tile and cause, hours driven. A store is filled with 30 days of sums
+of so many robots, and its size is measured.
 """
 
 import multiprocessing

@@ -1,9 +1,7 @@
 """A fleet that fetches a whole site at once, then a night's delta, and the whole again, from one server on loopback.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_service [--clients 300] [--site-mb 50] [--out FILE.json]
-
-Robots are threads of a few processes, each with its own zenoh session, and run the robot's own `ChunkReader`. Every byte of every robot
-is hashed. Meanwhile operators ask the HTTP list endpoints. The last round shows whether the server's memory grows once its caches are full.
+Robots are threads of a few processes, each with its own zenoh session, and run the robot's own `ChunkReader`. Every byte of every robot is
+hashed. Meanwhile operators ask the HTTP list endpoints. The last round shows whether the server's memory grows once its caches are full.
 """
 
 import multiprocessing
@@ -85,8 +83,6 @@ class _Robot:
         begun_s, begun_bytes = time.monotonic(), self._parts.received_bytes
         question = robot_key(SITE, self._name, "wanted")
         wanted = decode_message(self.bus.get(question, timeout_s=_PATIENCE_S), WantedVersion)
-        assert wanted.manifest_sha256 is not None
-        assert wanted.version is not None
         key = robot_key(SITE, self._name, f"manifests/{wanted.version}")
         old, new = (
             self.manifest,

@@ -1,6 +1,6 @@
 """What a running server costs."""
 
-import threading
+import itertools
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 import httpx
 import psutil
 
+from benchmarks.common.recorded_runs import resident_mb
+from support.waiting import repeated
+
 SITE = "bench"
-
-
-def resident_mb(pid: int) -> float:
-    """Memory of a process."""
-    return float(psutil.Process(pid).memory_info().rss / 1e6)
 
 
 def cpu_s(pid: int) -> float:
@@ -34,25 +32,16 @@ class Load:
 @contextmanager
 def measured(pid: int, http: str, pages: tuple[str, ...], every_s: float) -> Iterator[Load]:
     """Measures the server until the block ends, and asks it for one page after the other as an operator does."""
-    load, over = Load(rss_mb=[resident_mb(pid)]), threading.Event()
+    load, next_page = Load(rss_mb=[resident_mb(pid)]), itertools.cycle(pages)
+    with httpx.Client(base_url=http, timeout=30) as client:
 
-    def watch() -> None:
-        with httpx.Client(base_url=http, timeout=30) as client:
-            number = 0
-            while not over.wait(every_s):
-                page = pages[number % len(pages)]
-                asked_s = time.perf_counter()
-                client.get(page).raise_for_status()
-                load.page_ms.setdefault(page, []).append(1e3 * (time.perf_counter() - asked_s))
-                load.rss_mb.append(resident_mb(pid))
-                number += 1
+        def look() -> None:
+            page, asked_s = next(next_page), time.perf_counter()
+            client.get(page).raise_for_status()
+            load.page_ms.setdefault(page, []).append(1e3 * (time.perf_counter() - asked_s))
+            load.rss_mb.append(resident_mb(pid))
 
-    watcher = threading.Thread(target=watch)
-    begun_s, begun_cpu_s = time.monotonic(), cpu_s(pid)
-    watcher.start()
-    try:
-        yield load
-    finally:
-        load.cores = (cpu_s(pid) - begun_cpu_s) / (time.monotonic() - begun_s)
-        over.set()
-        watcher.join()
+        begun_s, begun_cpu_s = time.monotonic(), cpu_s(pid)
+        with repeated(look, every_s):
+            yield load
+            load.cores = (cpu_s(pid) - begun_cpu_s) / (time.monotonic() - begun_s)

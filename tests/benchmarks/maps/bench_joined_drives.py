@@ -1,10 +1,8 @@
 """Four rendered drives of one hall joined into one map, and two halves of each real recording.
 
-    PYTHONPATH=tests python -m benchmarks.maps.bench_joined_drives [--only NAME...] [--seed 60817] [--work FOLDER] [--out FILE.json]
-
 Each drive maps three of nine aisles and shares the last with the next drive. The halves of a real recording are its even and its odd pairs.
-Joined as in one night: all sessions are adjusted together. Joined to a published map: the first session is published, the others extend
-it. Errors are those of all frames after rigid alignment; moved: the distance by which the map's earlier keyframes leave their place.
+Joined as in one night: all sessions are adjusted together. Joined to a published map: the first session is published, the others extend it.
+Errors are those of all frames after rigid alignment; moved: the distance by which the map's earlier keyframes leave their place.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,13 +1,9 @@
 """Joining as a test: foreign sessions and true ones without pictures, through the decision that builds take.
 
-    PYTHONPATH=tests python -m benchmarks.maps.bench_joining [--only PART...] [--sites 15] [--true-sites 34]
-        [--seed 500] [--out FILE.json]
-
-A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its
-own building (whose coordinates mean nothing in the other), with docks put anywhere. True: sessions of the same day, the next, three days
-on, of which half leads through what is not in the map, and against the survey's direction. Lengths are 10
-to 80 m. Rates come with the 95 % bound of Clopper and Pearson. There is no joint adjustment: errors are those of the
-pose graph of fixes.
+A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its own
+building (whose coordinates mean nothing in the other), with docks put anywhere. True: sessions of the same day, the next, three days on, of
+which half leads through what is not in the map, and against the survey's direction. Lengths are 10 to 80 m. Rates come with the 95 % bound
+of Clopper and Pearson. There is no joint adjustment: errors are those of the pose graph of fixes.
 """
 
 from collections.abc import Iterator, Sequence

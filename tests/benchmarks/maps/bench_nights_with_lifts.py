@@ -1,7 +1,5 @@
 """Nights of one site with lifts, slips, exchanged pairs and a wrong calibration a week: ghosts that they publish, robots that these lose.
 
-    PYTHONPATH=tests python -m benchmarks.maps.bench_nights_with_lifts [--nights 30] [--seeds 10] [--work FOLDER] [--out FILE.json]
-
 Each night one drive lies in the inbox; a sound robot of day 2 is replayed in each version that it publishes. The seeds are sites of their
 own, each with the demo's lifted drive. A ghost is a landmark for robots of which the keyframe that defines it is so far off, by the
 simulator's truth, that it is moved by more than 0.2 m. A run that is interrupted goes on from what lies in the work folder.
@@ -72,7 +70,6 @@ def exchanged(session: Session) -> Iterator[CameraFrame]:
     """What a robot records whose front and rear topics are exchanged."""
     for frame in _frames(session):
         (rear,) = frame.others
-        assert rear is not None
         yield replace(rear, others=(replace(frame, others=()),))
 
 

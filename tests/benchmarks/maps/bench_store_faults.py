@@ -1,8 +1,7 @@
 """A store under faults at every file-system call, and every format under 10^5 damaged inputs.
 
-`PYTHONPATH=tests python -m benchmarks.maps.bench_store_faults [--every N] [--inputs N] [--within-s S] [--out FILE.json]`: a fault at every
-N-th call (1) for at most S seconds (900), and N inputs of all formats together. `tests/support/storage/store_faults.py` says what is tried
-and what is asked of the store afterwards.
+A fault at every `--every`-th call for at most `--within-s`, and `--inputs` of all formats together. tests/support/storage/store_faults.py
+says what is tried and what is asked of the store afterwards.
 """
 
 import json

@@ -1,8 +1,7 @@
 """Every surveyed view, looked at from half a metre and ten degrees aside: the robots' relocalizer in the published tiles.
 
-`PYTHONPATH=tests python -m benchmarks.maps.bench_views_aside [--only NAME...] [--work FOLDER] [--out FILE.json]`.
-Simulated sites are rendered from aside, the last view of the drive first; of public recordings every second frame makes no map, and
-is asked at its own place. Maps stay in the work folder.
+Simulated sites are rendered from aside, the last view of the drive first; of public recordings every second frame makes no map, and is
+asked at its own place. Maps stay in the work folder.
 """
 
 from collections.abc import Iterator
@@ -49,7 +48,6 @@ def published(store: Path) -> tuple[MapView, SurveyMap]:
         manifest = maps.manifest(SITE, manifest.version)
         tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
         archive = maps.archive(SITE, manifest.version)
-    assert archive is not None
     return MapView(tiles, default_vocabulary(), manifest.camera.focal_px), decode_archive(archive)
 
 

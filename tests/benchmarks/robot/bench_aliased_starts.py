@@ -1,12 +1,11 @@
 """What the localizer says where aisles are truly identical: starts at the estimator's level.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_aliased_starts [--starts N] [--seed N] [--only NAME...] [--out FILE.json]`.
-Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
-of two seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction,
-with look-alikes measured as a build does it. "along the aisle": N/10 drives of 22 m on the day after a survey of day 2, when stock was
-moved in every aisle, so that each has some slots of its own. "whole site": the robot may take it that its own aisle is in the map. Where
-it may not, it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin
-of an aisle that is not in the map nothing protects.
+Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites of two
+seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction, with
+look-alikes measured as a build does it. "along the aisle": N/10 drives of 22 m on the day after a survey of day 2, when stock was moved in
+every aisle, so that each has some slots of its own. "whole site": the robot may take it that its own aisle is in the map. Where it may not,
+it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin of an aisle
+that is not in the map nothing protects.
 """
 
 from dataclasses import asdict

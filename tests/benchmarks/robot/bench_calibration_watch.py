@@ -1,6 +1,5 @@
 """Robots with a wrong calibration in a map: what the watch finds within 30 s, what it costs until then, and false alarms.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_calibration_watch [--good N] [--work FOLDER] [--out FILE.json]`.
 A tote robot of a site that no development saw, in the map of its survey. `--good N` starts a good robot at N places of its drive, for 15 s
 each, instead of spoiling its calibration; each start is told its place as by a dock.
 """

@@ -1,7 +1,4 @@
-"""The figures of `make demo`: what its reports say of the build and of the two robots.
-
-`PYTHONPATH=tests python -m benchmarks.robot.bench_demo --out FILE.json`; about three minutes.
-"""
+"""The figures of `make demo`: what its reports say of the build and of the two robots; about three minutes."""
 
 import json
 import os

@@ -1,8 +1,7 @@
 """What the localizer says while something is broken, and how soon all is well again: one line for each fault of the simulator.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_faults [--only NAME...] [--work FOLDER] [--out FILE.json]`; recordings and map are
-kept in the work folder, where bench_localization.py finds the same. A row is right when the status within a second of the fault's
-beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
+Recordings and map are kept in the work folder, where bench_localization.py finds the same. A row is right when the status within a second
+of the fault's beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
 """
 
 from dataclasses import asdict, dataclass

@@ -1,6 +1,5 @@
 """Robots whose IMU falls silent, and robots too slow for their frames: TRACKING only within three sigmas of the truth.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_gaps [--seed SEED] [--sites N] [--only CASE...] [--work FOLDER] [--out FILE.json]`.
 On N sites (5) a drive of the next day is replayed with 12 gaps of 0.25, 0.5 or 1 s in the IMU's samples, half of them at a time, with and
 without wheels, or with a gyro that repeats its sample for 0.5 s; with 0, 25, 50 or 75 % of its frames missing at random; and begun on the
 way, without wheels and a coarse position, for 40 frames each.

@@ -1,8 +1,7 @@
 """The memory of a robot that drives for an hour: laps of a survey's loop, its stamps going on, in the map made of it.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_laps [--minutes M] [--work FOLDER] [--out FILE.json]`; recording and map as in
-bench_localization.py. Resident megabytes, the recording's samples of the whole drive among them, are taken once a minute of the drive; the
-first five are left out.
+Recording and map as in bench_localization.py. Resident megabytes, the recording's samples of the whole drive among them, are taken once a
+minute of the drive; the first five are left out.
 """
 
 from dataclasses import replace
@@ -41,12 +40,12 @@ def main(arguments: Options) -> Results:
             minute = (raw.stamp_ns - int(laps_ns[0])) // 60_000_000_000
             if minute > len(resident):
                 give_back_free_memory()
-                resident.append(resident_mb()["resident"])
+                resident.append(resident_mb())
                 print(f"{minute} min: {resident[-1]:.1f} MB", flush=True)
             if minute >= arguments.minutes:
                 break
     settled = resident[_SETTLED_MINUTES - 1 :] or resident[-1:]
-    found = {
+    return {
         "minutes": len(resident),
         "frames": number + 1,
         "tracking_share": tracking / (number + 1),
@@ -54,4 +53,3 @@ def main(arguments: Options) -> Results:
         "last_mb": settled[-1],
         "growth_share": max(settled) / settled[0] - 1.0,
     }
-    return found

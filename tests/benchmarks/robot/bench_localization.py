@@ -1,7 +1,6 @@
 """A robot in the map of another day: every figure that the project promises for it.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_localization [--only NAME...] [--seed N] [--work FOLDER] [--out FILE.json]`; recordings
-of `fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
+Recordings of `fleetsim record small-loop` and the map made of its survey stay in the work folder (FLEETMAP_BENCH_WORK, else the temporary
 folder) and serve again. CPU times are the process's, as they are and as the machine would take that the limits are for (yardstick.py).
 """
 
@@ -21,11 +20,6 @@ from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status, robot_key
-from fleetmap.odometry.odometry import Odometry
-from fleetmap.recordings import FrameSelection, open_recording
-from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sources.source import ReplaySource
-from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
 from support.recordings.hashes import hashed, tiles_of
@@ -39,23 +33,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "another site": ("--robot", "runner-1", "--day", "1", "--seed", "1"),
 }
 _UNSURE = (Status.LOST, Status.AMBIGUOUS)
-
-
-def odometry_ms(path: Path) -> list[float]:
-    """CPU milliseconds of each frame by odometry alone, rectification included."""
-    out, settings = [], LocalizerSettings()
-    with open_recording(path) as recording:
-        source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
-        rectifier = Rectifier(source.calibration)
-        odometry = Odometry(rectifier.rig, settings.odometry, settings.stereo)
-        for number, before in enumerate(source.samples_before_each()):
-            raw = source.frame(number)
-            begun_s = time.process_time()
-            odometry.handle_imu(before.imu)
-            odometry.handle_wheel(before.wheel)
-            odometry.handle_stereo(rectifier.rectify(raw))
-            out.append(1e3 * (time.process_time() - begun_s))
-    return out[run_metrics.WARM_UP_FRAMES :]
 
 
 def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
@@ -78,8 +55,7 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
         "cpu_mean_ms": None if cpu is None else cpu["mean"],
         "cpu_p99_ms": None if cpu is None else cpu["p99"],
         "unsure_p99_ms": float(np.percentile(unsure, 99)) if unsure else None,
-        "rss_mb": resident_mb()["resident"],
-        "rss_anonymous_mb": resident_mb()["anonymous"],
+        "rss_mb": resident_mb(),
         "stage_ms": run_metrics.stage_ms(frames),
         "status_share": run_metrics.status_share(frames),
     }
@@ -117,10 +93,7 @@ def main(arguments: Options) -> Results:
         run = played(recording, store)
         found[name] = run_figures(run.frames) | {"sha256": hashed(run.estimates)["estimates"]}
         slow.append(slowness())
-        alone = odometry_ms(recording)
         found[name] |= {
-            "odometry_alone_mean_ms": float(np.mean(alone)),
-            "odometry_alone_p99_ms": float(np.percentile(alone, 99)),
             "slowness": mean_of(slow),
             "cpu_mean_ms_at_reference": at_reference(found[name]["cpu_mean_ms"], slow),
             "cpu_p99_ms_at_reference": at_reference(found[name]["cpu_p99_ms"], slow),

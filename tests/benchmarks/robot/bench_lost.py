@@ -1,9 +1,8 @@
 """Robots that lose their place: carried, in the dark, at a wrong speed, with frames that do not arrive. Nothing may fail silently.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_lost [--runs N] [--seed SEED] [--only CASE...] [--work FOLDER] [--out FILE.json]`.
 Each case has N runs (50), every second one with an IMU alone or with nothing beside the cameras, in four aisles that look the same but for
-their ends; without pictures, but for dropped frames: those are of a rendered drive, kept in the work folder, since matches across a gap
-are of pictures. Half of these drop frames at random, half in bursts of up to a second.
+their ends; without pictures, but for dropped frames: those are of a rendered drive, kept in the work folder, since matches across a gap are
+of pictures. Half of these drop frames at random, half in bursts of up to a second.
 """
 
 from collections.abc import Callable

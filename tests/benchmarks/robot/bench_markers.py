@@ -1,8 +1,7 @@
 """Starts before a marker in one of six identical aisles, and before one that was moved by two metres: at the estimator's level.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_markers [--starts N] [--seed N] [--only NAME...] [--out FILE.json]`.
-N starts (100) of each kind, spread over the aisles of the drive. A marker of 0.2 m stands 0.8 to 2.2 m before the robot and is turned
-from it by up to 35 degrees, in pictures that OpenCV paints and the plug-in searches, as long as it is seen. "moved": its list places it two
+N starts (100) of each kind, spread over the aisles of the drive. A marker of 0.2 m stands 0.8 to 2.2 m before the robot and is turned from
+it by up to 35 degrees, in pictures that OpenCV paints and the plug-in searches, as long as it is seen. "moved": its list places it two
 metres off, in a direction of its own, in the identical aisles and in the same ones with signs at their ends; the robot drives on for ten
 seconds.
 """

@@ -1,6 +1,5 @@
 """One camera in maps that a pair made: real drives by their left camera with the IMU, the simulator's robot with wheels, and starts.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_one_camera [--only NAME...] [--work FOLDER] [--out FILE.json]`.
 Real drives are met in the map of all their own frames. Each of 20 starts is that of a robot that knows nothing, in the midst of a drive.
 """
 

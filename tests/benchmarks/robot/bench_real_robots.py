@@ -1,9 +1,7 @@
 """Robots in maps of real recordings: frames that did not make the map, backwards, and starts from nothing.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_real_robots [--only NAME...] [--work FOLDER] [--out FILE.json]`.
 The map is made of the recording's even frames; robots see the odd ones, so with the survey's light and camera. Maps stay in the work
-folder. CPU times are
-the process's.
+folder. CPU times are the process's.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """What ROS 2 costs a robot: a stereo driver of rclpy at 30 Hz and 752x480 sends to the robot's side, raw for long, then compressed, then
 with an IMU of 210 Hz while the robot publishes its estimates. CPU per frame is that of ROS 2 in the robot's process.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_ros2 --out FILE.json [--seconds 1200]`; needs `make ros2-env`.
+Needs `make ros2-env`.
 """
 
 import json

@@ -1,10 +1,8 @@
 """Robots that are switched on where they stand, by night and without a prior: how soon each finds itself.
 
-`PYTHONPATH=tests python -m benchmarks.robot.bench_standing_starts [--seed N] [--starts N] [--only PIPELINE...]
-[--work FOLDER] [--out FILE.json]`. The map is that of `small-loop`'s survey by day;
-three days later, at places spread over another robot's drive, each
-robot stands and sees every frame with noise of its own. Every start is repeated with all within ELSEWHERE_M of it taken out of the map:
-what names a place then is wrong.
+The map is that of `small-loop`'s survey by day; three days later, at places spread over another robot's drive, each robot stands and sees
+every frame with noise of its own. Every start is repeated with all within ELSEWHERE_M of it taken out of the map: what names a place then
+is wrong.
 """
 
 from collections.abc import Sequence

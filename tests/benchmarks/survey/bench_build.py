@@ -1,11 +1,8 @@
 """How fast a survey is built, and how much memory a long one takes.
 
-    PYTHONPATH=tests python -m benchmarks.survey.bench_build [--minutes M] [--work FOLDER] [--out FILE.json]
-
-The speed is that of the five aisles, recorded into the work folder, after a build of a short piece that loads the
-libraries. The long recording is the same drive again and again,
-left and entered where place, heading and velocity agree, stamps going on. So every lap is a revisit of all laps before: the worst case
-for whatever grows with revisits.
+The speed is that of the five aisles, recorded into the work folder, after a build of a short piece that loads the libraries. The long
+recording is the same drive again and again, left and entered where place, heading and velocity agree, stamps going on. So every lap is a
+revisit of all laps before: the worst case for whatever grows with revisits.
 """
 
 import json
@@ -27,22 +24,14 @@ from fleetmap.recordings.mcap.writer import copy_to_mcap
 def build(recording: Path, folder: Path, frames: str) -> dict[str, Any]:
     """The report of a build in a process of its own, its figures beside it."""
     report = folder / f"{recording.stem}.json"
-    slow, begin_s = [slowness()], _children_cpu_s()
+    slow, begin_s = [slowness()], sum(os.times()[2:4])
     to_store = ["--site", recording.stem, "--store", str(folder / "store"), "--report", str(report), "--frames", frames]
     subprocess.run([*tool("mapserver"), "build", str(recording), *to_store], stdout=subprocess.DEVNULL, check=True)
-    cpu_ms = 1e3 * (_children_cpu_s() - begin_s)
+    cpu_s = sum(os.times()[2:4]) - begin_s  # of children
     slow.append(slowness())
     found: dict[str, Any] = json.loads(report.read_text("utf-8"))
-    at_reference_ms = at_reference(cpu_ms, slow)
     keys = ("frames", "keyframes", "duration_s", "seconds", "realtime_factor", "ate_rmse_m", "peak_rss_mb")
-    return {key: found[key] for key in keys} | {
-        "cpu_s_at_reference": None if at_reference_ms is None else 1e-3 * at_reference_ms
-    }
-
-
-def _children_cpu_s() -> float:
-    times = os.times()
-    return times.children_user + times.children_system
+    return {key: found[key] for key in keys} | {"cpu_s_at_reference": at_reference(cpu_s, slow)}
 
 
 def measure(source: Path, minutes: int) -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """The grid of planners against the truth of simulated warehouses, and what a night takes away of moved stock.
 
-    PYTHONPATH=tests python -m benchmarks.survey.bench_grid SCENARIO:SEED ... [--out FILE.json]
-
-Every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo and the cells do,
-without a survey's error. Then those of another day. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
+Halls are given as SCENARIO:SEED. Every so many frames of the scenario's first run are rendered and looked at from their true poses: what
+dense stereo and the cells do, without a survey's error. Then those of another day. A path is planned by A* between two places of the drive,
+for a robot of 0.3 m radius.
 """
 
 from dataclasses import asdict, dataclass
@@ -35,7 +34,6 @@ def views_from_truth(session: Session, before: Tiles) -> SessionViews:
         seen.append((dense_disparity(frame, rectifier.camera, StereoSettings()), place))
     few = seen[:: max(1, len(seen) // 15)]
     floor_m = floor_distance_m([(disparity[0], place) for disparity, place in few], rectifier.camera)
-    assert floor_m is not None
     views = SessionViews(before)
     for disparity, place in seen:
         px, sigma_px = disparity

@@ -1,7 +1,5 @@
 """Surveys that are mapped while they drive: whether tracking and mapping keep up with frames that come at their own speed.
 
-    PYTHONPATH=tests python -m benchmarks.survey.bench_live RECORDING... [--out FILE.json]
-
 The draft at the end is that of `build`, to the byte, so that its accuracy is not measured again. On a machine that does nothing else.
 """
 

@@ -1,8 +1,7 @@
 """Scale of a survey by a rig with a wrong baseline, without and with two markers of known distance.
 
-`PYTHONPATH=tests python -m benchmarks.survey.bench_marker_scale [--seed N] [--work FOLDER] [--out FILE.json]`. The loop with two
-markers is built with a baseline that is 1 % too long, then with the calibration that `mapserver markers` writes. off: true metres per metre
-of the map's trajectory, less one.
+The loop with two markers is built with a baseline that is 1 % too long, then with the calibration that `mapserver markers` writes. off:
+true metres per metre of the map's trajectory, less one.
 """
 
 import subprocess
@@ -31,7 +30,6 @@ def built(drive: Path, store: Path, calibration: Path, version: int) -> float:
     subprocess.run([*tool("mapserver"), "build", str(drive), *to_store, "--calibration", str(calibration)], check=True)
     with MapStore.open(store) as maps, open_recording(drive) as recording:
         archive = maps.archive("hall", version)
-        assert archive is not None
         truth, trajectory = recording.ground_truth, decode_archive(archive).trajectory
         pairs = [
             (truth.at(int(stamp_ns)), at)

@@ -3,6 +3,7 @@
 import hashlib
 from datetime import datetime, timedelta
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -129,10 +130,7 @@ def test_damaged_and_missing_bytes_are_server_errors(server: Server) -> None:
 
 
 def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("secret")
-
-    monkeypatch.setattr(server.store, "sites", fail)
+    monkeypatch.setattr(server.store, "sites", Mock(side_effect=ZeroDivisionError("secret")))
     response = server.client.get("/v1/sites")
     check_problem(response, 500, "internal error")
     assert "secret" not in response.text
@@ -186,9 +184,7 @@ def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPat
 
 
 def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise StoreError("no space left on device")
-
+    refuse = Mock(side_effect=StoreError("no space left on device"))
     server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=1, version=1, status="LOST"))
     with monkeypatch.context() as full:
         full.setattr(server.store.fleet, "add", refuse)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import anyio
 import pytest
@@ -89,9 +90,7 @@ def test_a_page_from_elsewhere_changes_nothing(server: Server) -> None:
 def test_a_store_that_does_not_answer_lets_nobody_in(
     server: Server, monkeypatch: pytest.MonkeyPatch, asked: str
 ) -> None:
-    def away(*_: object) -> None:
-        raise StoreError("postgresql://db.example/site_a cannot be read")
-
+    away = Mock(side_effect=StoreError("postgresql://db.example/site_a cannot be read"))
     vic = named(server)["vic"] if asked == "session" else {}
     monkeypatch.setattr(type(server.store.operators), asked, away)
     with client_of(server) as client:

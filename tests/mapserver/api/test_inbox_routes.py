@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import quote
 
 import anyio
@@ -213,10 +214,8 @@ def test_a_build_without_space_is_an_answer_and_in_no_log(
 ) -> None:
     lab.mkdir()
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(night_runs, "TemporaryFile", full)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(night_runs, "TemporaryFile", Mock(side_effect=full))
     check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 503, "No space left")
     assert server.store.log(site="lab", limit=1)[0].kind == "saved"
 

@@ -57,8 +57,6 @@ def test_moments_name_their_zone() -> None:
 @pytest.mark.parametrize("minutes", [5, 60, 6 * 60, 24 * 60])
 def test_steps_around_a_clock_change_are_ranges_that_can_be_asked_for(day: str, minutes: int) -> None:
     first_ns, end_ns = read_range(day, day, BERLIN)
-    assert first_ns is not None
-    assert end_ns is not None
     edges = steps(first_ns, end_ns, minutes * 60 * 10**9, BERLIN)
     assert (edges[0], edges[-1]) == (first_ns, end_ns)
     for edge, following in pairwise(edges):

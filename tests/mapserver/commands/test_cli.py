@@ -6,6 +6,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -18,10 +19,9 @@ from fleetmap.errors import UsageError
 from fleetmap.sensors.samples import SensorSet
 from mapserver import cli
 from mapserver.config import MapserverConfig, read_config
-from mapserver.drafting.draft import BuildRequest, Draft
+from mapserver.drafting.draft import Draft
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
-from mapserver.survey.settings import SurveySettings
 from support.command_line import status
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
@@ -83,13 +83,11 @@ def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[st
 
 
 def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted() -> None:
-        raise KeyboardInterrupt
-
+    interrupted = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(cli, "app", interrupted)
     assert status("mapserver", "build") == 130
     monkeypatch.undo()
-    monkeypatch.setattr("mapserver.store.MapStore.open", lambda *_, **__: interrupted())
+    monkeypatch.setattr("mapserver.store.MapStore.open", interrupted)
     assert status("mapserver", "versions", "--site", "lab", "--store", "s") == 130
     assert "Traceback" not in capsys.readouterr().err
 
@@ -134,12 +132,7 @@ def test_the_file_gives_defaults_and_the_command_line_wins(tmp_path: Path, capsy
 def test_build_takes_its_settings_from_the_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = []
-
-    def build(request: BuildRequest, settings: SurveySettings, *, recorded: bool) -> tuple[Draft, None]:
-        seen.append((request, settings))
-        return Draft(1, "done", {}, {}), None
-
+    build = Mock(return_value=(Draft(1, "done", {}, {}), None))
     monkeypatch.setattr("mapserver.library.build_draft", build)
     opened = nullcontext(SimpleNamespace(sensor_set=SensorSet.STEREO))
     monkeypatch.setattr("mapserver.library.open_recording", lambda path, options: opened)
@@ -150,7 +143,7 @@ def test_build_takes_its_settings_from_the_file(
     )
     assert status("mapserver", "build", "r", "--config", file) == 0
     assert status("mapserver", "--config", file, "build", "r", "--frames", "::2") == 0
-    (order, settings), (second, _) = seen
+    (order, settings), (second, _) = (call.args for call in build.call_args_list)
     assert (order.site, order.store, order.options.frames) == ("lab", tmp_path, "::3")
     assert order.options.frame_from_ground_truth
     assert (settings.seed, settings.keyframes.min_overlap, settings.keyframes.max_interval_s) == (7, 0.5, 2.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC
 from io import BytesIO
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import msgspec
@@ -246,21 +247,15 @@ def test_a_robot_that_wavers_is_drawn_in_few_parts() -> None:
 
 
 def test_many_pages_look_once(store: MapStore) -> None:
-    class Counting(Fleet):
-        looked = 0
-
-        def robots(self, site: str | None = None) -> list[RobotStatus]:
-            self.looked += 1
-            return [status(robot="a"), status(robot="b", last_health={"status": "LOST"})]
-
-    fleet, now = Counting(store), [0.0]
+    fleet, now = Fleet(store), [0.0]
+    fleet.robots = Mock(return_value=[status(robot="a"), status(robot="b", last_health={"status": "LOST"})])
     live = LiveRobots(fleet, lambda: now[0])
     assert [robot.name for robot in live.look(SITE)] == ["b", "a"]
     live.look(SITE)
-    assert fleet.looked == 1
+    assert fleet.robots.call_count == 1
     now[0] = 1.0
     live.look(SITE)
-    assert fleet.looked == 2
+    assert fleet.robots.call_count == 2
 
 
 def test_health_of_a_site(store: MapStore) -> None:

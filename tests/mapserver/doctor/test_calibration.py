@@ -2,17 +2,16 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from fleetmap.errors import FleetmapError, StoreError, SurveyError
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
-from mapserver.calibration.motion_rows import CalibrationData
 from mapserver.calibration.parameters import COLUMNS
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import MeasuredCalibration, corrected, findings_of, in_words, measure_calibration
@@ -69,18 +68,14 @@ def test_frames_are_followed_again_only_where_that_may_change_a_verdict(
 ) -> None:
     """A principal point that moved by 3.5 px is none that a robot would notice, and the recording is used as it is."""
     turned = {"camera_imu_y": off["principal_x"] / Rectifier(calibration()).camera.focal_px}  # which looks the same
-    followed: list[object] = []
+    follow = Mock()
     monkeypatch.setattr(recordings, "estimate_from", lambda _: estimate(**off, **turned))
     stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
     recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
-
-    def follow(_: Recording, rig: RigCalibration, __: object) -> Any:
-        followed.append(rig)
-
     measure_calibration(recording, follow)
-    assert (len(followed) == 1) == is_enough
+    assert (follow.call_count == 1) == is_enough
     recordings.estimate_calibration([recording], follow)
-    assert len(followed) > 2, "who writes the calibration wants the best one"
+    assert follow.call_count > 2, "who writes the calibration wants the best one"
 
 
 def test_an_error_far_beyond_a_coarse_sigma_is_found_and_not_corrected() -> None:
@@ -128,9 +123,7 @@ def test_subjects_are_judged_by_all_of_their_parameters() -> None:
 
 @pytest.mark.parametrize("error", [StoreError("the disk is full"), SurveyError("it is dark")])
 def test_only_what_the_frames_lack_is_not_judged(error: FleetmapError) -> None:
-    def follow(*_: object) -> CalibrationData:
-        raise error
-
+    follow = Mock(side_effect=error)
     stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
     recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
     if isinstance(error, StoreError):

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -103,11 +104,8 @@ def test_a_full_disk_under_the_output_does_not_stop_a_build(tmp_path: Path) -> N
 
 
 def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def busy(*_: object) -> None:
-        raise StoreError("the store is busy")
-
     with MapStore.open(tmp_path, create=True) as maps, recorded_job(maps, "new", "build") as job:
-        monkeypatch.setattr(maps, "tell_progress", busy)
+        monkeypatch.setattr(maps, "tell_progress", Mock(side_effect=StoreError("the store is busy")))
         JobProgress(maps, job.number)("odometry", 1, 2)
         job.report = {"version": 1}
     with MapStore.open(tmp_path) as maps:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,10 +12,8 @@ from rich.console import Console
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings import Recording
 from fleetmap.recordings.sensor_subset import with_other_views
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import SensorSet
-from mapserver.doctor import Finding
 from mapserver.drafting.admission import CheckedRecording
 from mapserver.drafting.draft_evidence import MappedSession, ProbedFrame
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
@@ -134,16 +133,12 @@ def test_further_views_are_examined_beside_the_corrected_first_one(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A plate of cameras that is turned as a whole agrees with itself, and no longer once its first view is corrected."""
-    turn, seen = se3_exp(np.array([0, 0, 0.02, 0, 0, 0])), list[RigCalibration]()
+    turn, further = se3_exp(np.array([0, 0, 0.02, 0, 0, 0])), Mock(return_value=[])
 
     def checked(recording: Recording, *_: object) -> CheckedRecording:
         rig = recording.calibration
         turned = tuple(replace(c, body_from_cam=turn @ c.body_from_cam) for c in rig.cameras)
         return CheckedRecording(replace(rig, cameras=turned), [], RigEvidence(""), {})
-
-    def further(recording: Recording) -> list[Finding]:
-        seen.append(recording.calibration)
-        return []
 
     monkeypatch.setattr("mapserver.drafting.survey_recordings.checked", checked)
     monkeypatch.setattr("mapserver.drafting.admission.further_findings", further)
@@ -153,5 +148,6 @@ def test_further_views_are_examined_beside_the_corrected_first_one(
         )
         with reading.open(recorded) as (recording, _):
             whole = recording.calibration.cameras
-    for camera, nominal, motion in zip(seen[0].cameras, whole, (turn, turn, np.eye(4), np.eye(4)), strict=True):
+    seen = further.call_args.args[0].calibration
+    for camera, nominal, motion in zip(seen.cameras, whole, (turn, turn, np.eye(4), np.eye(4)), strict=True):
         np.testing.assert_allclose(camera.body_from_cam, motion @ nominal.body_from_cam)

@@ -36,7 +36,7 @@ from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.pinhole_pair import CAMERA
 
@@ -111,12 +111,7 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
 
     The pictures of one that was tried do not fill the build's file.
     """
-    frames = []
-
-    def begin(inputs: SurveyInputs, _: SurveySettings, tools: SurveyTools) -> Any:
-        frames.append(inputs.frame_count)
-        return [tools.images]
-
+    begin = Mock(side_effect=lambda inputs, settings, tools: [tools.images])
     monkeypatch.setattr(survey_recordings, "begin_survey", begin)
     monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
     with open_recording(drive) as recording, mapped_images.MappedImageStore(tmp_path) as images:
@@ -135,6 +130,7 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
         long = replace(recording, frame_stamps_ns=np.arange(8, dtype=np.int64) * 20_000_000_000)
         begun(long, tried, unwatched)
         begun(long, given, unwatched)
+        frames = [call.args[0].frame_count for call in begin.call_args_list]
         assert frames == [8, 8, 8, 2, 8]  # what is tried for a long drive is its busiest half minute
 
 

@@ -1,6 +1,7 @@
 """Nothing that robots send grows without bound: failures in rate, size and number, pictures in bytes, traces, robots. Rows 8, 9, 23."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -82,18 +83,13 @@ def test_rates_forget_nobody_who_floods(clock: Clock) -> None:
 
 def test_a_full_table_of_rates_is_not_searched_at_every_message(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     """Invented names would else cost milliseconds each, and everybody waits for them."""
-    limit, searched, search = RateLimit(2, 1.0, clock), [0], RateLimit._forget
-
-    def counted(self: RateLimit, now_ns: int) -> None:
-        searched[0] += 1
-        search(self, now_ns)
-
-    monkeypatch.setattr(RateLimit, "_forget", counted)
+    limit = RateLimit(2, 1.0, clock)
+    monkeypatch.setattr(limit, "_forget", search := Mock(side_effect=limit._forget))
     for number in range(20_000):
         limit.admits(number)
     for number in range(1000):
         assert not limit.admits(f"invented {number}")
-    assert searched[0] == 1
+    search.assert_called_once()
     clock.now_ns += 3 * SECOND_NS
     assert limit.admits("invented 1")
 

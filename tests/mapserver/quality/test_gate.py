@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from fleetmap.bow.vocabulary import decode_vocabulary, default_vocabulary_bytes
 from fleetmap.features import extraction
-from fleetmap.features.orb import Features, detect_in_slices
+from fleetmap.features.orb import detect_in_slices
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat.manifest import BlobEntry, CameraEntry, Manifest, RecordingEntry, TileEntry
@@ -18,8 +19,7 @@ from fleetmap.mapformat.tile import Tile, encode_tile
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
-from fleetmap.time_sliced import TimeSliced
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
 from mapserver.drafting.draft_evidence import (
     Before,
     MappedSession,
@@ -317,18 +317,13 @@ def test_a_site_that_is_in_the_map_twice_is_refused() -> None:
 
 
 def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[OrbSettings] = []
-
-    def other(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> TimeSliced[Features]:
-        asked.append(settings)
-        return (yield from detect_in_slices(image, settings, clearance_px))
-
-    monkeypatch.setitem(extraction.EXTRACTORS, "other", other)
+    monkeypatch.setitem(extraction.EXTRACTORS, "other", other := Mock(side_effect=detect_in_slices))
     rectifier = Rectifier(calibration())
     sample = ride_sample(two_walls, 2, FRAME_S)
     frame = rectifier.rectify(CameraFrame(int(sample.stamps_ns[0]), sample.left[0], sample.right[0]))
     probe_features(frame, rectifier.camera, OrbSettings(extractor="other", count=1200, fast_threshold=9))
-    assert [(s.extractor, s.fast_threshold, s.count) for s in asked] == [("other", 9, RelocalizerSettings().orb.count)]
+    ((_, used, *_), _) = other.call_args
+    assert (used.extractor, used.fast_threshold, used.count) == ("other", 9, RelocalizerSettings().orb.count)
 
 
 def test_a_map_made_with_a_wrong_calibration_is_refused() -> None:

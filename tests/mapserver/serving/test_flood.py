@@ -5,7 +5,6 @@ Rows 8 and J1 of docs/security.md. Every load ends after some seconds; the serve
 
 import os
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -34,7 +33,7 @@ from mapserver.store import Actor, FailureFilter, MapStore, TokenRow
 from support.fleet.dashboard_scene import Served, serving
 from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
-from support.waiting import eventually
+from support.waiting import eventually, repeated
 
 SECONDS = float(os.environ.get("FLOOD_SECONDS", "1.5"))
 PICTURE = Thumbnail(stamp_ns=1, kind="frame", jpeg=b"\xff\xd8" + bytes(60_000) + b"\xff\xd9")
@@ -79,7 +78,7 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
     }.get(kind, b"")
     calm = f"calm-{kind.replace(' ', '-')}"
     before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
-    ended, sent, waits, numbers = threading.Event(), [0], [], count()
+    sent, waits, numbers = [0], [], count()
     with Bus(served.zenoh).open() as evil, Bus(served.zenoh).open() as bus:
         decode_message(bus.get(robot_key("lab", calm, "wanted")), WantedVersion)
 
@@ -94,15 +93,11 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
         flooded = robot_key("lab", "flood", key)
 
         def flood() -> None:
-            while not ended.is_set():
-                for _ in range(20):
-                    send(flooded, payload)
-                sent[0] += 20
-                time.sleep(0.002)
+            for _ in range(20):
+                send(flooded, payload)
+            sent[0] += 20
 
-        thread = threading.Thread(target=flood)
-        thread.start()
-        try:
+        with repeated(flood, 0.002):
             until_s = time.monotonic() + SECONDS
             while time.monotonic() < until_s or len(waits) < 4:
                 begun_s = time.monotonic()
@@ -113,9 +108,6 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
                 decode_message(bus.get(robot_key("lab", calm, "manifests/1"), timeout_s=5.0), Part)
                 waits.append(time.monotonic() - begun_s)
                 time.sleep(max(0.4, SECONDS / 40))
-        finally:
-            ended.set()
-            thread.join()
     time.sleep(1.0)
     more_mb, more_disk_mb = memory_mb(served) - before_mb, disk_mb(served.folder) - before_disk_mb
     print(f"{kind}: {sent[0]} sent, waits {max(waits):.3f} s, memory {more_mb:+.0f} MB, disk {more_disk_mb:+.1f} MB")

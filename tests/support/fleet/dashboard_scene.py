@@ -1,9 +1,9 @@
 """A small hall with versions, jobs, robots and failures, a server over it, and a browser to look at it with."""
 
+import itertools
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -35,6 +35,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, DraftContent, MapStore
 from support.pages.browser import agree
 from support.storage.map_samples import draft_details
+from support.waiting import repeated
 
 SITE = "hall"
 ROBOTS = 300
@@ -197,26 +198,19 @@ def speak(bus: Bus, robot: str, stamp_ns: int, place_m: tuple[float, float], sta
 def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]]]:
     """Robots that report every second, most of them well; entries of the dictionary move them, and they are lost there."""
     moved: dict[str, tuple[float, float]] = {}
-    ended = threading.Event()
+    stamps_ns = itertools.count(time.time_ns(), 1_000_000_000)
     with Bus(endpoint).open() as bus:
 
         def talk() -> None:
-            stamp_ns = time.time_ns()
-            while not ended.is_set():
-                for number in range(count):
-                    robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
-                    there = moved.get(robot)
-                    speak(bus, robot, stamp_ns, there or place_of(number), "LOST" if there else status)
-                stamp_ns += 1_000_000_000
-                ended.wait(1.0)
+            stamp_ns = next(stamps_ns)
+            for number in range(count):
+                robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
+                there = moved.get(robot)
+                speak(bus, robot, stamp_ns, there or place_of(number), "LOST" if there else status)
 
-        thread = threading.Thread(target=talk)
-        thread.start()
-        try:
+        talk()
+        with repeated(talk, 1.0):
             yield moved
-        finally:
-            ended.set()
-            thread.join()
 
 
 @dataclass

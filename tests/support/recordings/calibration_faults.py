@@ -139,7 +139,6 @@ def swapped(good: Recording) -> Recording:
     """Left images in the place of right ones."""
 
     def exchanged(frame: StoredFrame) -> StoredFrame:
-        assert frame.right is not None
         return replace(frame, left=frame.right, right=frame.left)
 
     return with_frames(good, np.arange(len(good)), exchanged)
@@ -152,7 +151,6 @@ def mirrored(good: Recording) -> Recording:
         return png_image(np.ascontiguousarray(cv2.flip(decode_grey(image), 1)))
 
     def changed(frame: StoredFrame) -> StoredFrame:
-        assert frame.right is not None
         return replace(frame, left=flipped(frame.left), right=flipped(frame.right))
 
     return with_frames(good, np.arange(len(good)), changed)

@@ -73,7 +73,6 @@ def with_darkness(recording: Recording, start_s: float, end_s: float) -> Recordi
     def darken(frame: StoredFrame) -> StoredFrame:
         if not start_s <= (frame.stamp_ns - first_ns) * 1e-9 < end_s:
             return frame
-        assert frame.right is not None
         rng = np.random.default_rng(frame.stamp_ns)
         shape = decode_grey(frame.left).shape
         left, right = (png_image(np.clip(rng.normal(2.0, 0.8, shape), 0, 255).astype(np.uint8)) for _ in range(2))

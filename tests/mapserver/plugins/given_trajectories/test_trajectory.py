@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,7 +24,6 @@ from mapserver.plugins.given_trajectories import given as given_module
 from mapserver.plugins.given_trajectories.formats import WrittenPoses
 from mapserver.plugins.given_trajectories.given import GivenTrajectory, OwnMotion, fitted_scale, stamps_on_clock
 from mapserver.survey.odometry_pass import poses_as_odometry
-from mapserver.survey.state import OdometryPass
 from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, write_mcap
 from support.worlds.box_room import out_and_back, ride_sample, there_and_back
 
@@ -214,19 +214,14 @@ def test_a_build_from_poses_makes_a_map_of_them(
     room_ride: Path, tmp_path: Path, use: SensorSet | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Upright too, though the frame of the poses is not: by gravity, or by how the body began."""
-    begun_with: list[int] = []
-
-    def begun(given: Trajectory, *rest: Any) -> OdometryPass:
-        begun_with.append(len(given))
-        return poses_as_odometry(given, *rest)
-
-    monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun)
+    monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun := Mock(side_effect=poses_as_odometry))
     file = written(tmp_path / "p.tum", drifted(), in_seconds(), camera=True, scale=0.1)
     options = BuildOptions(use=use, trajectory=GivenTrajectory(file), threads=1)
     done = build_map(room_ride, tmp_path / "maps", "hall", options)
     assert done.report["ate_rmse_m"] < 0.02
     assert done.report["keyframes"] > 5
-    assert begun_with == [FRAMES]
+    begun.assert_called_once()
+    assert len(begun.call_args.args[0]) == FRAMES
     (said,) = [words for words in done.report["findings"]["ride"] if words.startswith("trajectory p.tum (TUM)")]
     assert "poses of the camera" in said
     up = done.trajectory.frame_from_body[:, 2, :3]

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -85,32 +86,22 @@ def test_viewers_get_what_stands_there_and_what_comes(server: FoxgloveServer) ->
 
 
 def test_nothing_is_made_that_nobody_looks_at(server: FoxgloveServer) -> None:
-    made: list[int] = []
-
-    def make() -> ChannelMessage:
-        made.append(1)
-        return channels.place("/fixes", 1, np.eye(4))
-
+    make = Mock(return_value=channels.place("/fixes", 1, np.eye(4)))
     assert not is_shown(server)
     server.show([Shown("/fixes", 1, make)] * 3)
     time.sleep(0.2)
-    assert made == []
+    make.assert_not_called()
     with FoxgloveClient(server.url) as viewer:
         viewer.subscribe(["/fixes"])
         viewer.wait_for("/fixes")
-        assert made == [1]
+        make.assert_called_once()
         assert is_shown(server)
 
 
 def test_a_message_that_cannot_be_made_ends_nothing(server: FoxgloveServer) -> None:
-    def damaged() -> ChannelMessage:
-        raise RecordingError("an image is damaged; leave it out")
-
-    def broken() -> ChannelMessage:
-        raise ZeroDivisionError
-
+    faults = RecordingError("an image is damaged; leave it out"), ZeroDivisionError()
     with looking(server) as viewer:
-        server.show([Shown("/fixes", 1, damaged), Shown("/fixes", 2, broken), place(3)])
+        server.show([*(Shown("/fixes", n, Mock(side_effect=fault)) for n, fault in enumerate(faults, 1)), place(3)])
         assert viewer.wait_for("/fixes")[0][0] == 3
 
 

@@ -14,11 +14,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from asyncio import CancelledError
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, patch
 
 import msgspec
 import numpy as np
@@ -110,20 +112,14 @@ def spend(folder: Path, **more: Any) -> str:
 def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
     hall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    used: list[SurveySettings] = []
-
-    def spied(request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str]) -> tuple[Draft, None]:
-        used.append(settings)
-        return built(request, settings, unusable)
-
-    config = hall / "site.toml"
+    config, build = hall / "site.toml", Mock(side_effect=built)
     config.write_text("[survey]\nseed = 5\n")
-    monkeypatch.setattr(night, "build_draft", spied)
+    monkeypatch.setattr(night, "build_draft", build)
     monkeypatch.setattr("mapserver.library.sensor_set_of", lambda *_: SensorSet.MONO)
     spend(hall, options=BuildOptions(config=config))
-    assert used == [survey_settings(config, SensorSet.MONO)]
-    assert used[0] != survey_settings(config, SensorSet.STEREO_INERTIAL)
-    assert used[0].seed == 5
+    used = build.call_args.args[1]
+    assert used == survey_settings(config, SensorSet.MONO) != survey_settings(config, SensorSet.STEREO_INERTIAL)
+    assert used.seed == 5
 
 
 def test_a_night_removes_what_is_older_than_its_period(hall: Path) -> None:
@@ -563,16 +559,8 @@ def test_a_night_that_was_killed_or_ran_out_of_space_is_gone_on_with(hall: Path,
 def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
     hall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class KilledError(BaseException):
-        pass
-
-    def killed(*_: object, **__: object) -> int:
-        raise KilledError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(releases, "publish", killed)
-        with pytest.raises(KilledError):
-            spend(hall)
+    with patch.object(releases, "publish", side_effect=CancelledError), pytest.raises(CancelledError):  # as if killed
+        spend(hall)
     monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))
     assert "version 1 published" in spend(hall)
     report = last_report(hall / "store", "hall")

@@ -82,7 +82,6 @@ def test_gravity_decides_roll_and_pitch() -> None:
 def test_held_motion_stays() -> None:
     scene = make_scene(keyframes=6, landmarks=150, step_s=0.5, seed=33, noise_px=1.0, inertial=True)
     problem = disturbed(scene.problem, seed=5, rot_rad=0.01, trans_m=0.05, points_m=0.05)
-    assert problem.inertial is not None
     held = np.array([True, False, False, False, False, False])
     result = optimize(replace(problem, inertial=replace(problem.inertial, fixed=held)), PATIENT)
     is_unchanged = result.motions[:, :3] == scene.velocities_map_mps
@@ -92,7 +91,6 @@ def test_held_motion_stays() -> None:
 def test_same_optimum_as_gtsam() -> None:
     scene = make_scene(keyframes=6, landmarks=120, step_s=0.5, seed=35, noise_px=1.0, inertial=True)
     problem = disturbed(scene.problem, seed=36, rot_rad=0.01, trans_m=0.05, points_m=0.05)
-    assert problem.inertial is not None
     unrobust = BundleSettings(max_iterations=100, relative_cost_tolerance=1e-12, huber_sigmas=1e6)
     ours = optimize(problem, unrobust)
     graph, values = gtsam_graph(problem, 1e6)

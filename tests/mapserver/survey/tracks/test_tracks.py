@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -83,16 +83,14 @@ def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
     settings = SurveySettings()
     map_from_body = np.array([out_and_back(6.0)(t) for t in (2.0, 2.3, 2.6, 2.9)])
     keyframes, rectifier = rendered_keyframes(map_from_body, settings)
-    pairs = []
-    for i in range(4):
-        for j in range(i + 1, 4):
-            predicted = (
-                se3_inverse(map_from_body[j] @ rectifier.body_from_cam) @ map_from_body[i] @ rectifier.body_from_cam
-            )
-            inputs = MatchInputs(keyframes, rectifier.camera, settings.pairs)
-            match = match_pair(i, j, inputs, PredictedMotion(predicted, 0.02))
-            assert match is not None
-            pairs.append(match)
+    map_from_cam, inputs = (
+        map_from_body @ rectifier.body_from_cam,
+        MatchInputs(keyframes, rectifier.camera, settings.pairs),
+    )
+    pairs = [
+        match_pair(i, j, inputs, PredictedMotion(se3_inverse(map_from_cam[j]) @ map_from_cam[i], 0.02))
+        for i, j in combinations(range(4), 2)
+    ]
     posed = RigImages.of(keyframes, map_from_body, rig_of(rectifier))
     marks = build_landmarks(posed, tracks_of(pairs), settings)
     return keyframes, map_from_body, rectifier, marks
