@@ -48,6 +48,7 @@ AREAS = (
     b'{"type":"FeatureCollection","frame":"map","features":[{"type":"Feature","properties":{"name":"a"},'
     b'"geometry":{"type":"Polygon","coordinates":[[[0,0],[1,0],[1,1],[0,0]]]}}]}'
 )
+THERE = {"site": "hall", "job": 1, "number": 1, "robot": "r1", "operator": "olga", "place": 0, "box": "held"}
 POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
 FAILURE = blindness(
     site="hall", tile=(0, 0), innovation=4.0, radius_95_m=0.2,
@@ -73,17 +74,10 @@ def ask_operation(
     @given(case=operation.as_strategy())
     def ask(case: schemathesis.Case) -> None:
         number, path = len(statuses), case.path_parameters
-        if number % 2 and "site" in path:
-            path["site"] = "hall"
-            path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
-        path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
-        path |= {name: value for name, value in known.items() if number % 2 and name in path}
-        path |= {"robot": "r1"} if number % 2 and "robot" in path else {}
-        path |= {"operator": "olga"} if number % 2 and "operator" in path else {}
-        path |= {"place": 0} if number % 2 and "place" in path else {}
-        path |= {"name": f"{number}.mcap"} if number % 2 and "name" in path else {}
-        path |= {"box": "held", "name": f"held-{number}.mcap"} if number % 2 and "box" in path else {}
-        path |= {name: value for name, value in chosen(operation.label).items() if number % 2}
+        if number % 2:
+            there = THERE | {"name": f"held-{number}.mcap" if "box" in path else f"{number}.mcap"} | known
+            there |= dict.fromkeys(("version", "before", "after"), 1 + number % 3)
+            path |= {name: there[name] for name in path.keys() & there.keys()} | chosen(operation.label)
         if number % 2 and isinstance(case.body, dict) and "incident" in case.body:
             case.body["incident"] = "failure/hall/1"
         if number % 2 and operation.label.endswith("/estimate"):

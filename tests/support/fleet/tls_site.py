@@ -53,12 +53,7 @@ class TlsSite:
         with (self.folder / "server.log").open("ab") as log:
             command = self.command("mapserver", *words)
             self.server = subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, stderr=log, text=True)
-        said = {}
-        for line in self.server.stdout:
-            if line == "ready\n":
-                break
-            name, _, value = line.strip().partition(": ")
-            said[name] = value
+        said = dict(line.strip().split(": ", 1) for line in iter(self.server.stdout.readline, "ready\n"))
         self.http, self.endpoint = said["http"], said["zenoh"]
 
     def stop(self, number: int = signal.SIGTERM) -> int:

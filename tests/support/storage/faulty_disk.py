@@ -144,7 +144,7 @@ def _install_os(disk: Disk) -> None:
         name = "" if isinstance(path, int) else os.fspath(path)
         if not disk.holds(name):
             return _real["open"](path, flags, mode, **more)
-        is_new = bool(flags & os.O_CREAT) and not _exists(name)
+        is_new = bool(flags & os.O_CREAT) and not os.access(name, os.F_OK)
         begin("create" if is_new else "open", name)
         descriptor = _real["open"](path, flags, mode, **more)
         paths[descriptor], offsets[descriptor] = name, 0
@@ -209,14 +209,6 @@ def _install_os(disk: Disk) -> None:
     os.unlink, os.mkdir = on_path("unlink", "unlink", True), on_path("mkdir", "mkdir", True)
     os.stat, os.scandir = on_path("look", "stat", False), on_path("look", "scandir", False)
     os.read, os.pread = on_descriptor("read"), on_descriptor("pread")
-
-
-def _exists(path: str) -> bool:
-    try:
-        _real["stat"](path)
-    except OSError:
-        return False
-    return True
 
 
 _P, _I, _L = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
@@ -290,7 +282,7 @@ def _opening(disk: Disk, real: Any) -> Any:
         path = ctypes.string_at(name).decode() if name else ""
         if not disk.holds(path):
             return int(real(vfs, name, file, flags, found))
-        is_new = bool(flags & _OPEN_CREATE) and not _exists(path)
+        is_new = bool(flags & _OPEN_CREATE) and not os.access(path, os.F_OK)
         if code := _code(disk, "create" if is_new else "open"):
             ctypes.c_void_p.from_address(file).value = None  # SQLite does not close what has no methods
             return code
@@ -347,7 +339,7 @@ def _deleting(disk: Disk, real: Any) -> Any:
         if disk.holds(path):
             if code := _code(disk, "unlink"):
                 return code
-            if _exists(path):
+            if os.access(path, os.F_OK):
                 disk.note("unlink", path)
                 if sync:
                     disk.note("sync_folder", folder_of(path))

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleetmap.errors import FleetmapError
@@ -170,14 +170,7 @@ def fuzz(name: str, count: int, folder: Path) -> dict[str, float]:
     found: dict[str, float] = {"inputs": 0, "refused": 0, "slowest_s": 0.0}
     before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    @settings(
-        max_examples=count,
-        derandomize=True,
-        deadline=None,
-        database=None,
-        phases=(Phase.generate,),
-        suppress_health_check=list(HealthCheck),
-    )
+    @settings(max_examples=count, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
     @given(data=strategy())
     def one(data: bytes) -> None:
         found["inputs"] += 1

@@ -44,8 +44,7 @@ class DiskImage:
             _settle(self._files[path], self._files[path].pending)
             self._files[path].pending = []
         elif kind == "rename":
-            moved = self._files[path]
-            self._name(call[2], moved)
+            self._name(call[2], self._files[path])
             self._name(path, None)
         elif kind == "unlink":
             self._name(path, None)

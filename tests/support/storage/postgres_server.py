@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -12,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+from fleetmap.bus.endpoints import with_free_port
 
 _BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
 
@@ -25,9 +26,7 @@ class PostgresServer:
         self._account = {"user": "postgres", "group": "postgres"} if os.geteuid() == 0 else {}
         if self._account:
             shutil.chown(folder, "postgres", "postgres")
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
+        self._port = with_free_port("tcp/127.0.0.1:0").rpartition(":")[2]
         self._run("initdb", "-D", str(folder / "data"), "-A", "trust", "-U", "fleet", "--no-sync", "-E", "UTF8")
         self.start()
 
@@ -41,20 +40,13 @@ class PostgresServer:
             if self._account:
                 shutil.chown(own, "postgres", "postgres")
             settings += ["ssl=on", f"ssl_cert_file={own}", f"ssl_key_file={own}"]
-        command = [
-            "setpriv",
-            *become,
-            "--pdeathsig",
-            "QUIT",
-            str(_BINARIES[-1] / "postgres"),
-            "-D",
-            str(self._folder / "data"),
-        ]
+        command = ["setpriv", *become, "--pdeathsig", "QUIT", str(_BINARIES[-1] / "postgres")]
+        command += ["-D", str(self._folder / "data")]
         command += [word for setting in settings for word in ("-c", setting)]
         with (self._folder / "log").open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log, cwd="/")
         while subprocess.run(
-            [str(_BINARIES[-1] / "pg_isready"), "-q", "-h", "127.0.0.1", "-p", str(self._port)], check=False
+            [str(_BINARIES[-1] / "pg_isready"), "-q", "-h", "127.0.0.1", "-p", self._port], check=False
         ).returncode:
             assert self._process.poll() is None, (self._folder / "log").read_text()
             time.sleep(0.05)
@@ -67,20 +59,12 @@ class PostgresServer:
     def database(self, *options: str) -> str:
         """The URL of a new database. options: of createdb."""
         self._count += 1
-        self._run("createdb", *options, "-h", "127.0.0.1", "-p", str(self._port), "-U", "fleet", f"d{self._count}")
+        self._run("createdb", *options, "-h", "127.0.0.1", "-p", self._port, "-U", "fleet", f"d{self._count}")
         return f"postgresql://fleet@127.0.0.1:{self._port}/d{self._count}"
 
     def _run(self, program: str, *words: str) -> None:
         command = [str(_BINARIES[-1] / program), *words]
-        subprocess.run(
-            command,
-            check=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            timeout=120,
-            **self._account,
-        )
+        subprocess.run(command, check=True, capture_output=True, cwd="/", timeout=120, **self._account)
 
 
 @contextmanager
@@ -88,10 +72,9 @@ def postgres_server() -> Iterator[PostgresServer]:
     """Skips where the package is missing."""
     if not _BINARIES:
         pytest.skip("NO POSTGRESQL: a database on a server is not tested; apt-get install postgresql to do it")
-    folder = Path(tempfile.mkdtemp(prefix="postgres-"))
-    server = PostgresServer(folder)
-    try:
-        yield server
-    finally:
-        server.stop()
-        shutil.rmtree(folder)
+    with tempfile.TemporaryDirectory(prefix="postgres-") as folder:
+        server = PostgresServer(Path(folder))
+        try:
+            yield server
+        finally:
+            server.stop()
