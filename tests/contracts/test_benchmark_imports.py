@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-TESTS = Path(__file__).parents[1]
+from conftest import TESTS
+
 PROGRAMS = sorted(path for folder in ("benchmarks", "studies", "golden") for path in (TESTS / folder).rglob("*.py"))
 OURS = ("fleetmap", "mapserver", "locclient", "fleetsim", "benchmarks", "studies", "golden", "support")
 

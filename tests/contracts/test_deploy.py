@@ -61,8 +61,7 @@ def environment(stage: str) -> dict[str, str]:
 
 def exec_form(value: str) -> list[str]:
     """The words of CMD or HEALTHCHECK; JSON, which no shell reads."""
-    found: list[str] = json.loads(value[value.index("[") :])
-    return found
+    return json.loads(value[value.index("[") :])  # type: ignore[no-any-return]
 
 
 def command_lines() -> dict[str, list[str]]:
@@ -70,13 +69,8 @@ def command_lines() -> dict[str, list[str]]:
     lines = [(f"CMD {image}", shlex.join(exec_form(last(image, "CMD")))) for image in ("server", "robot")]
     lines.append(("HEALTHCHECK robot", shlex.join(exec_form(last("robot", "HEALTHCHECK")))))
     lines += [(f"compose {name}", shlex.join(service.get("command", []))) for name, service in SERVICES.items()]
-    lines += [
-        (stage, part)
-        for stage, steps in STAGES.items()
-        for word, rest in steps
-        if word == "RUN"
-        for part in rest.split("&&")
-    ]
+    runs = [(stage, rest) for stage, steps in STAGES.items() for word, rest in steps if word == "RUN"]
+    lines += [(stage, part) for stage, rest in runs for part in rest.split("&&")]
     for path in [*UNITS, DEPLOY / "compose.yaml"]:
         for line in path.read_text("utf-8").splitlines():
             if line.startswith("Exec"):
@@ -118,9 +112,8 @@ def test_commands_know_the_options_that_deployment_and_documents_give_them() -> 
 @pytest.mark.parametrize("name", SERVICES)
 def test_containers_have_no_rights_and_write_to_volumes_alone(name: str) -> None:
     service, image = SERVICES[name], "robot" if name == "robot" else "server"
-    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", last(image, "USER")), (
-        "a number, by which a cluster sees that it is not root"
-    )
+    user = last(image, "USER")
+    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", user), "a number, by which a cluster sees that it is not root"
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
@@ -173,33 +166,22 @@ def test_examples_agree_on_ports() -> None:
 def test_versions_are_those_of_this_tree() -> None:
     version = tomllib.loads(text("pyproject.toml"))["project"]["version"]
     files = [path for path in DEPLOY.rglob("*") if path.is_file() and path.suffix != ".lock"]
-    named = [
-        n for path in files for n in re.findall(r"fleetmap-(?:server:|robot:)?(\d+\.\d+\.\d+)", path.read_text("utf-8"))
-    ]
+    of_ours = re.compile(r"fleetmap-(?:server:|robot:)?(\d+\.\d+\.\d+)")
+    named = [number for path in files for number in of_ours.findall(path.read_text("utf-8"))]
     assert len(named) >= 8
     assert {*named, version} == {fleetmap.__version__}
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda path: path.name)
-def test_units_keep_what_they_write_to_their_user(unit: Path) -> None:
+def test_units_have_few_rights_and_keep_what_they_write_to_their_user(unit: Path) -> None:
     settings = dict(line.split("=", 1) for line in unit.read_text("utf-8").splitlines() if re.match(r"\w+=", line))
     assert (settings["UMask"], settings["StateDirectoryMode"], settings["NoNewPrivileges"]) == ("0077", "0700", "yes")
     assert settings["MemoryMax"]
-
-
-RULES = DEPLOY / "prometheus-alerts.yml"
-
-
-@pytest.mark.parametrize("unit", UNITS, ids=[unit.name for unit in UNITS])
-def test_units_have_few_rights(unit: Path) -> None:
     program = shutil.which("systemd-analyze")
     if program is None:
-        pytest.skip(
-            "systemd-analyze is not installed (apt-get install systemd): the rights of the units are NOT judged"
-        )
-    told = subprocess.run(
-        [program, "security", "--offline=true", str(unit)], capture_output=True, text=True, check=True
-    )
+        pytest.skip("NO SYSTEMD-ANALYZE (apt-get install systemd): the rights of the units are NOT judged")
+    command = [program, "security", "--offline=true", str(unit)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True)
     found = re.search(r"exposure level for \S+: ([0-9.]+)", told.stdout)
     assert found is not None, told.stdout
     assert float(found[1]) <= 3.0
@@ -217,15 +199,14 @@ def test_rules_and_board_ask_for_what_the_server_exports(tmp_path: Path) -> None
     board = json.loads(text("deploy/grafana-dashboard.json"))["panels"]
     asked = [target["expr"] for panel in board for target in panel["targets"]]
     assert len({panel["id"] for panel in board}) == len(board)
-    (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
+    (group,) = yaml.safe_load(text("deploy/prometheus-alerts.yml"))["groups"]
     assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in group["rules"])
     asked += [rule["expr"] for rule in group["rules"]]
     assert len(asked) >= 10
     for name, given in re.findall(r"\b((?:fleetmap|process)_\w+)(?:\{(.*?)\})?", " ".join(asked)):
         assert name in names
-        assert set(re.findall(r"(\w+)[=!]", given)) <= labels.get(
-            name, {"site", "version", "area", "cause", "robot"}
-        ), name
+        known = labels.get(name, {"site", "version", "area", "cause", "robot"})
+        assert set(re.findall(r"(\w+)[=!]", given)) <= known, name
 
 
 def test_the_kernel_takes_the_rules_of_the_firewall() -> None:
@@ -245,9 +226,7 @@ def test_the_kernel_takes_the_rules_of_the_firewall() -> None:
 def test_nothing_says_to_install_the_project_by_its_bare_name() -> None:
     """Any index may give that name to somebody else."""
     assert BY_NAME.search('/opt/fleetmap/bin/pip install "fleetmap[server]"')
-    assert not BY_NAME.search(
-        'pip install -c constraints.txt "./dist/fleetmap-0.1.0-cp311-cp311-linux_x86_64.whl[server]"'
-    )
+    assert not BY_NAME.search('pip install -c constraints.txt "./dist/fleetmap-0.1.0-cp311-linux_x86_64.whl[server]"')
     pages = [path for path in REPOSITORY.rglob("*.md") if ".venv" not in path.parts]
     sources = [path for folder in PACKAGES for path in folder.rglob("*.py")]
     assert [str(path) for path in (*UNITS, *pages, *sources) if BY_NAME.search(path.read_text("utf-8"))] == []

@@ -11,9 +11,13 @@ import pytest
 from fleetmap import messages
 from fleetmap.messages import Cause, Flag
 from locclient.replay.run_metrics import METRICS
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
 from mapserver.drafting.report import BuildReport
+from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.quality import figures
+from mapserver.store import MapStore
 from mapserver.survey.merge.multi_session import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, generate_docs, rows, section, text
 
@@ -22,7 +26,12 @@ GENERATE = generate_docs()
 SERVICE = "docs/service.md"
 REPORTS = "docs/reports.md"
 DOCUMENTS = sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/*.md"))
+PAGES = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", *DOCUMENTS]
 LINKED = re.compile(r"\]\((?!https?:)([^)#]+)")
+
+
+def named(page: str, heading: str) -> set[str]:
+    return {code_words(row[0])[0] for row in rows(section(page, heading))}
 
 
 @pytest.mark.parametrize("path", GENERATE.PAGES, ids=str)
@@ -44,37 +53,26 @@ def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() ->
 
 def test_endpoints_are_documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapserver.api.app.plugins", lambda _: {})  # a plug-in's README has its own
-    from mapserver.api.app import create_app
-    from mapserver.api.metrics import Metrics
-    from mapserver.fleet.fleet import Fleet
-    from mapserver.store import MapStore
-
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         metrics = Metrics(store, fleet)
         paths = set(create_app(store, fleet, metrics=metrics).openapi()["paths"])
         families = set(re.findall(r"^# TYPE (fleetmap_\w+)", metrics.text().decode(), re.MULTILINE))
-    documented = {code_words(row[0])[0] for row in rows(section(SERVICE, "HTTP"))}
-    assert documented == paths | {"/openapi.json"}
+    assert named(SERVICE, "HTTP") == paths | {"/openapi.json"}
     # The client library exposes the creation time of every counter beside it.
-    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Metrics"))} == {
-        family for family in families if not family.endswith("_created")
-    }
+    assert named(SERVICE, "Metrics") == {family for family in families if not family.endswith("_created")}
 
 
 def test_bus_keys_are_documented() -> None:
     keys = set(re.findall(r"^(fleetmap/\S+)", inspect.getdoc(messages) or "", re.MULTILINE))
     assert len(keys) >= 7
-    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Bus"))} == keys
+    assert named(SERVICE, "Bus") == keys
 
 
 def _fields(*kinds: type) -> set[str]:
     """Names of the fields of records."""
-    return {
-        field.name
-        for kind in kinds
-        for field in (dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else msgspec.structs.fields(kind))
-    }
+    found = (dataclasses.fields(k) if dataclasses.is_dataclass(k) else msgspec.structs.fields(k) for k in kinds)
+    return {field.name for fields in found for field in fields}
 
 
 EVIDENCE = (
@@ -98,7 +96,7 @@ RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", 
     ],
 )
 def test_keys_are_documented(page: str, heading: str, keys: set[str]) -> None:
-    assert {code_words(row[0])[0] for row in rows(section(page, heading))} == keys
+    assert named(page, heading) == keys
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
@@ -106,9 +104,7 @@ def test_every_document_is_reached_from_the_readme(document: str) -> None:
     assert document in text("README.md")
 
 
-@pytest.mark.parametrize(
-    "document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "shared/README.md", *DOCUMENTS]
-)
+@pytest.mark.parametrize("document", [*PAGES, "shared/README.md"])
 def test_links_lead_somewhere(document: str) -> None:
     folder = (REPOSITORY / document).parent
     missing = [target for target in LINKED.findall(text(document)) if not (folder / target).exists()]
@@ -116,7 +112,7 @@ def test_links_lead_somewhere(document: str) -> None:
     assert len(missing) == len(plugins) and not any((folder / side / "plugins").exists() for side in plugins), missing
 
 
-@pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", *DOCUMENTS])
+@pytest.mark.parametrize("document", PAGES)
 def test_files_that_are_named_exist(document: str) -> None:
     """A path in a document may be shortened at its left: `survey/pipeline.py`."""
     named = set(re.findall(r"`([\w./-]+\.(?:py|toml|sh|service))`", text(document)))

@@ -3,17 +3,15 @@
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+from support.fleet.contracts_documents import REPOSITORY
+
 ROOTS = ("shared", "mapserver", "locclient", "tests", "deploy")
 # Names of values that say neither target nor source, alone or as the last word; and T as in papers.
 VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
 # Functions act on poses and messages of that name; only one that is nothing but the word returns a matrix.
 VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
-ALLOWED = {
-    "mapserver/fleet/fleet.py": {"last_pose"}  # the last PoseMessage as plain values, not a matrix
-}
+ALLOWED = {"mapserver/fleet/fleet.py": {"last_pose"}}  # the last PoseMessage as plain values, not a matrix
 # Products are checked where both names say one of the project's own frames; others may be the same by another name.
 KNOWN = {"map", "survey", "odom", "body", "base", "cam"}
 FRAMES = re.compile(r"^_?([a-z0-9_]+?)_from_([a-z0-9_]+)$")

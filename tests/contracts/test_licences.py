@@ -7,7 +7,7 @@ from importlib.metadata import distribution
 from packaging.requirements import Requirement
 
 from contracts.test_dependencies import PROJECT
-from support.fleet.contracts_documents import text
+from support.fleet.contracts_documents import section
 
 COPYLEFT = re.compile(r"\b(A|L)?GPL|GNU|Mozilla|MPL|Eclipse|EPL|CDDL|EUPL")
 UNNAMED = {"pyrage": "MIT"}  # which carries its licence as text alone
@@ -21,19 +21,17 @@ def name_of(text: str) -> str:
 def libraries() -> set[str]:
     """The default install: of the extras client and server, with all that those ask for."""
     lines = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["server"]]
-    found: set[str] = set()
     todo = [(name_of(r.name), frozenset(r.extras)) for r in map(Requirement, lines)]
     seen = set(todo)
     while todo:
         name, extras = todo.pop()
-        found.add(name)
         for more in map(Requirement, distribution(name).requires or []):
             asked = any(more.marker is None or more.marker.evaluate({"extra": extra}) for extra in ("", *extras))
             entry = name_of(more.name), frozenset(more.extras)
             if asked and entry not in seen:
                 seen.add(entry)
                 todo.append(entry)
-    return found
+    return {name for name, _ in seen}
 
 
 def licence(name: str) -> str:
@@ -47,10 +45,6 @@ def licence(name: str) -> str:
 def test_the_default_install_has_no_copyleft_and_is_listed() -> None:
     found = libraries()
     assert [name for name in sorted(found - CHOICE) if COPYLEFT.search(licence(name))] == []
-    section = text("docs/install.md").partition("## Licences")[2].partition("\n## ")[0]
-    listed = {
-        name_of(word)
-        for row in re.findall(r"^\|[^|]+\|([^|]+)\|$", section, re.M)
-        for word in re.findall(r"[\w.-]+", row)
-    }
+    cells = re.findall(r"^\|[^|]+\|([^|]+)\|$", section("docs/install.md", "Licences"), re.M)
+    listed = {name_of(word) for cell in cells for word in re.findall(r"[\w.-]+", cell)}
     assert found - listed == set(), "docs/install.md lists every library under its licence"

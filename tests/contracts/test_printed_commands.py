@@ -21,10 +21,8 @@ def _texts(tree: ast.AST) -> Iterator[tuple[int, str]]:
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in {"Option", "Argument"}:
             continue
         if isinstance(node, ast.JoinedStr):
-            yield (
-                node.lineno,
-                "".join(str(part.value) if isinstance(part, ast.Constant) else "1" for part in node.values),
-            )
+            parts = (str(part.value) if isinstance(part, ast.Constant) else "1" for part in node.values)
+            yield node.lineno, "".join(parts)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.lineno, node.value
         else:

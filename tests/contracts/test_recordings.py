@@ -34,21 +34,13 @@ WITHOUT_TRUTH = ("video", "kitti-raw")
 
 
 def _write_mcap(folder: Path) -> Path:
-    folder.mkdir()
     copy_to_mcap(open_recording(write_mcap(folder / "source", SAMPLE)), folder / "copy.mcap")
     return folder / "copy.mcap"
 
 
 def _write_kitti_raw(folder: Path) -> Path:
-    frames = [
-        CameraFrame(int(stamp), *pair) for stamp, *pair in zip(SAMPLE.stamps_ns, SAMPLE.left, SAMPLE.right, strict=True)
-    ]
+    frames = list(map(CameraFrame, SAMPLE.stamps_ns.tolist(), SAMPLE.left, SAMPLE.right))
     return write_kitti_raw(folder / "drive", calibration(), frames)
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
 
 
 def _messages(folder: Path) -> list[Message]:
@@ -69,7 +61,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "tum-rgbd": lambda folder: write_tum_rgbd(folder, SAMPLE),
     "mcap": _write_mcap,
     "rosbag2-sqlite": lambda folder: write_rosbag2(folder / "bag", _messages(folder)),
-    "video": lambda folder: write_video(_made(folder) / "a.mp4", SAMPLE.left, [50 * n for n in range(5)]),
+    "video": lambda folder: write_video(folder.with_suffix(".mp4"), SAMPLE.left, [50 * n for n in range(5)]),
     "rosbag1": lambda folder: write_rosbag1(folder / "a.bag", _messages(folder)),
 }
 WITHOUT_CALIBRATION = ("tum-rgbd", "video")
@@ -90,17 +82,6 @@ def opened(path: Path) -> Recording:
     return open_recording(path, OpenOptions(rig))
 
 
-def _assert_same_frames(first: Recording, second: Recording) -> None:
-    np.testing.assert_array_equal(first.frame_stamps_ns, second.frame_stamps_ns)
-    for index in (len(first) - 1, 0, 2):  # in no order
-        a, b = first.read_frame(index), second.read_frame(index)
-        assert a.stamp_ns == b.stamp_ns == first.frame_stamps_ns[index]
-        for x, y in ((a.left, b.left), (a.right, b.right), (a.depth_m, b.depth_m)):
-            assert (x is None) == (y is None)
-            if x is not None:
-                np.testing.assert_array_equal(x, y)
-
-
 def test_each_format_has_a_writer_here() -> None:
     assert set(WRITERS) >= set(recording_formats())  # fewer without plug-ins
 
@@ -111,9 +92,7 @@ def test_exactly_its_own_format_recognises_it(path: Path) -> None:
 
 def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
     recording = opened(path)
-    assert {issue.what for issue in recording.issues} == (
-        {"stamps uncertain"} if recording.format == "video" else set()
-    )
+    assert [issue.what for issue in recording.issues] == ["stamps uncertain"] * (recording.format == "video")
     assert len(recording) == len(SAMPLE.left)
     assert (np.diff(recording.frame_stamps_ns) > 0).all()
     for index in (3, 0, 4, 4):
@@ -142,7 +121,6 @@ def test_truth_is_that_of_the_body(path: Path) -> None:
         pytest.skip("it holds no truth")
     for index, stamp_ns in enumerate(recording.frame_stamps_ns):
         frame_from_body = recording.ground_truth.at(int(stamp_ns))
-        assert frame_from_body is not None
         frame_from_cam = frame_from_body @ recording.calibration.cameras[0].body_from_cam
         np.testing.assert_allclose(frame_from_cam, world_from_cam0(int(SAMPLE.stamps_ns[index])), atol=1e-9)
 
@@ -153,7 +131,12 @@ def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
     with open_recording(tmp_path / "converted.mcap") as copy:
         assert copy.issues == source.issues
         assert (copy.name, copy.sensor_set) == (source.name, source.sensor_set)
-        _assert_same_frames(source, copy)
+        np.testing.assert_array_equal(source.frame_stamps_ns, copy.frame_stamps_ns)
+        for index in (len(source) - 1, 0, 2):  # in no order
+            a, b = source.read_frame(index), copy.read_frame(index)
+            assert a.stamp_ns == b.stamp_ns == source.frame_stamps_ns[index]
+            for image in ("left", "right", "depth_m"):
+                np.testing.assert_array_equal(getattr(a, image), getattr(b, image))
         for field in ("stamps_ns", "gyro_radps", "accel_mps2"):
             np.testing.assert_array_equal(getattr(source.imu, field), getattr(copy.imu, field))
         assert format_calibration(copy.calibration) == format_calibration(source.calibration)

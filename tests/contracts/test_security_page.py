@@ -4,10 +4,9 @@ import re
 
 import pytest
 
-from support.fleet.contracts_documents import REPOSITORY
+from support.fleet.contracts_documents import REPOSITORY, text
 
-PAGE = (REPOSITORY / "docs" / "security.md").read_text("utf-8")
-ROWS = re.findall(r"^\| ([\d, ]*)\|.*\| ([^|]*) \|$", PAGE, re.MULTILINE)
+ROWS = re.findall(r"^\| ([\d, ]*)\|.*\| ([^|]*) \|$", text("docs/security.md"), re.MULTILINE)
 NAMED = re.compile(r"`(?:(tests/[\w/]+\.py|\w+\.py))?((?:::\w+)*)`")
 
 
@@ -17,12 +16,10 @@ def test_every_attack_stands_in_a_table() -> None:
 
 @pytest.mark.parametrize("tests", sorted({tests for _, tests in ROWS if "`" in tests}))
 def test_its_tests_exist(tests: str) -> None:
-    path = None
-    named = NAMED.findall(tests)
+    path, named = None, NAMED.findall(tests)
     assert named
     for file, names in named:
         if file:
             path = REPOSITORY / file if file.startswith("tests/") else path.parent / file
-        text = path.read_text("utf-8")
         for name in names.split("::")[1:]:
-            assert re.search(rf"^\s*(?:def|class) {name}\b", text, re.MULTILINE), (str(path), name)
+            assert re.search(rf"^\s*(?:def|class) {name}\b", path.read_text("utf-8"), re.MULTILINE), (str(path), name)

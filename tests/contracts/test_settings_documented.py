@@ -42,28 +42,18 @@ def test_the_settings_are_found() -> None:
 def test_tiers_name_settings_that_exist(program: str) -> None:
     existing = {(setting.section, setting.key) for setting in settings_in(PROGRAMS[program][0])}
     existing |= {(section, "*") for section, _ in existing}
-    named = {
-        (section, key)
-        for keys in PROGRAMS[program][1].values()
-        for section, words in keys.items()
-        for key in words.split()
-    }
-    assert named <= existing
+    tiers = [item for keys in PROGRAMS[program][1].values() for item in keys.items()]
+    assert {(section, key) for section, words in tiers for key in words.split()} <= existing
 
 
 def test_every_setting_is_read_somewhere() -> None:
     """A setting that nothing reads promises something that does not happen."""
-    files = [path for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))]
-    source = "\n".join(path.read_text("utf-8") for path in files)
-    core = "\n".join(
-        path.read_text("utf-8") for path in (REPOSITORY / "shared/core").rglob("*") if path.suffix in {".cpp", ".h"}
+    files = [path for folder in (*PACKAGES, "shared/core") for path in (REPOSITORY / folder).rglob("*.*")]
+    source, core = (
+        "\n".join(path.read_text("utf-8") for path in files if path.suffix in kinds)
+        for kinds in ({".py"}, {".cpp", ".h"})
     )
     read = {*re.findall(r"\.(\w+)", source), *re.findall(r"[\"'](\w+)(?=[\"'])", source)}
     read |= {*re.findall(r'\["(\w+)"\]', core)}  # which takes a section as an object
-    unread = [
-        f"{name}.{field.name}"
-        for name, kind in _sections().items()
-        for field in msgspec.structs.fields(kind)
-        if field.name not in read
-    ]
-    assert unread == []
+    fields = [(name, field.name) for name, kind in _sections().items() for field in msgspec.structs.fields(kind)]
+    assert [field for field in fields if field[1] not in read] == []

@@ -98,9 +98,8 @@ def test_log_of_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 run(app, *asked, "--store", tmp_path, "--actor", "carl", "--reason", "why")
             else:
                 told.append(server.client.post(f"/v1/{words}", json=body | {"actor": "dan", "reason": "because"}))
-        server.client.headers["Authorization"] = (
-            f"Bearer {Operators(server.store).make_token('ada', [*Scope], 1, NOBODY)}"
-        )
+        token = Operators(server.store).make_token("ada", [*Scope], 1, NOBODY)
+        server.client.headers["Authorization"] = f"Bearer {token}"
         told += [server.client.post(f"/v1/{words}", json=body | {"reason": "so"}) for words, body in SIGNED_IN]
         assert {answer.status_code for answer in told} == {200}, [answer.text for answer in told]
         shown = (

@@ -10,12 +10,7 @@ import pytest
 
 from support.fleet.contracts_documents import REPOSITORY
 
-PACKAGES = {
-    "fleetmap": REPOSITORY / "shared" / "fleetmap",
-    "fleetsim": REPOSITORY / "shared" / "fleetsim",
-    "mapserver": REPOSITORY / "mapserver",
-    "locclient": REPOSITORY / "locclient",
-}
+PACKAGES = ("shared/fleetmap", "shared/fleetsim", "mapserver", "locclient")
 
 _LONGEST_FUNCTION = 60  # lines
 
@@ -23,10 +18,9 @@ _LONGEST_FUNCTION = 60  # lines
 @cache
 def _modules() -> dict[str, Path]:
     found = {}
-    for package, folder in PACKAGES.items():
-        for path in sorted(folder.rglob("*.py")):
-            parts = path.relative_to(folder).with_suffix("").parts
-            found[".".join((package, *(part for part in parts if part != "__init__")))] = path
+    for path in (path for package in PACKAGES for path in sorted((REPOSITORY / package).rglob("*.py"))):
+        parts = path.relative_to(REPOSITORY).with_suffix("").parts
+        found[".".join(part for part in parts if part not in {"shared", "__init__"})] = path
     return found
 
 
@@ -49,9 +43,8 @@ def _imports(module: str, statements: list[ast.stmt]) -> set[str]:
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {
-                name if (name := f"{node.module}.{alias.name}") in _modules() else node.module for alias in node.names
-            }
+            names = [(f"{node.module}.{alias.name}", node.module) for alias in node.names]
+            found |= {full if full in _modules() else module for full, module in names}
     return {name for name in found if name in _modules() and name != module}
 
 

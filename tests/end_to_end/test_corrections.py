@@ -1,7 +1,6 @@
 """Corrections of a map by areas: they survive nights and a rollback, and a screen that is never used does no more harm."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,9 +39,8 @@ def drawn(kinds: dict[str, tuple[float, float]]) -> bytes:
 
 
 def draw(store: Path, kinds: dict[str, tuple[float, float]]) -> None:
-    with MapStore.open(
-        store, clock_ns=lambda: START_NS - 10**9
-    ) as maps:  # before the nights, whose clock is the recordings'
+    before_ns = START_NS - 10**9  # the nights, whose clock is the recordings'
+    with MapStore.open(store, clock_ns=lambda: before_ns) as maps:
         keep_areas(maps, "lab", drawn(kinds), "corrected", ADA)
 
 
@@ -72,9 +70,7 @@ class Corrected:
     def archived(self, version: int, kind: str) -> tuple[NDArray[np.uint32], Array]:
         """Ids and positions of all landmarks of a version in an area, those among them that robots do not get."""
         with MapStore.open(self.store) as maps:
-            data = maps.archive("lab", version)
-        assert data is not None
-        known = decode_archive(data)
+            known = decode_archive(maps.archive("lab", version))
         inside = within(known.points_map, kind)
         return known.landmark_ids[inside], known.points_map[inside]
 
@@ -90,8 +86,8 @@ def within(points_map: Array, kind: str) -> NDArray[np.bool_]:
 
 
 @pytest.fixture(scope="module")
-def corrected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Corrected]:
-    yield Corrected(tmp_path_factory.mktemp("corrected"))
+def corrected(tmp_path_factory: pytest.TempPathFactory) -> Corrected:
+    return Corrected(tmp_path_factory.mktemp("corrected"))
 
 
 def test_corrections_survive_five_nights(corrected: Corrected) -> None:

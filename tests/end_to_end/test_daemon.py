@@ -25,14 +25,10 @@ from mapserver.trust import init_here
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.tls_site import TlsSite
 from support.recordings.recording_samples import calibration
+from support.waiting import eventually
 from support.worlds import robot_world
 
 PATIENCE_S = 120.0  # on a machine that may be busy
-
-
-def write_walk(folder: Path, frames: int, dark: range) -> Path:
-    """The robot's ride as a recording."""
-    return robot_world.write(folder, robot_world.bundles(frames, dark=dark))
 
 
 def configuration(folder: Path, recording: Path, endpoint: str, *, speed: float) -> Path:
@@ -58,25 +54,20 @@ def daemon(config: Path, notify: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def wait_for(found: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not found():
-        if time.monotonic() > deadline:
-            process.kill()
-        assert process.poll() is None, process.stderr.read() if process.stderr else ""
-        time.sleep(0.2)
+    is_over = eventually(lambda: found() or process.poll() is not None, PATIENCE_S)
+    if not (is_over and process.poll() is None):
+        process.kill()
+        pytest.fail(process.stderr.read() if process.stderr else "")
 
 
 @pytest.mark.timeout(1200)
 def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell(tmp_path: Path) -> None:
     """Away from its server, on what its disk holds, the robot goes dark: blind, dark. It is killed. A later life delivers."""
     hub, table = MemoryHub(), []
-    with (
-        MapStore.open(tmp_path / "store", create=True) as store,
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
-    ):
+    robot_world.stored(tmp_path / "store")
+    with MapStore.open(tmp_path / "store") as store, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.setblocking(False)
-        robot_world.save(store)
         with MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
             service = BusService(store, Fleet(store), bus, lambda *_: None)
             link = MapClient(robot_bus, TileCache(tmp_path / "cache"), "room", "r1")
@@ -85,15 +76,14 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
 
         with Bus("tcp/127.0.0.1:0", is_server=True).open() as found_port:
             endpoint = found_port.endpoint  # free again in a moment, and nobody answers there
-        dark_walk = write_walk(tmp_path / "dark", 280, range(130, 280))
+        dark_walk = robot_world.write(tmp_path / "dark", robot_world.bundles(280, dark=range(130, 280)))
         with daemon(configuration(tmp_path, dark_walk, endpoint, speed=0.0), tmp_path / "notify") as process:
             spool = tmp_path / "spool.sqlite3"
             wait_for(lambda: any((tmp_path / "failures").glob("*.json")), process)
             process.send_signal(signal.SIGKILL)
             process.wait()
-        waiting = Outbox(spool, max_bytes=10**8).waiting(10)
-        assert len(waiting) == 1
-        report = decode_message(waiting[0].payload, FailureReport)
+        (waiting,) = Outbox(spool, max_bytes=10**8).waiting(10)
+        report = decode_message(waiting.payload, FailureReport)
         assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
         assert any(note.inliers for note in report.fixes), "it had localised itself without any server"
         assert manager.recv(100) == b"READY=1"
@@ -108,7 +98,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             init_here(store)
             service = BusService(store, fleet, bus, lambda *_: None)
             bus.queryable(robot_key("*", "*", "failures"), take)
-            light_walk = write_walk(tmp_path / "light", 70, range(0))
+            light_walk = robot_world.write(tmp_path / "light", robot_world.bundles(70))
             config = configuration(tmp_path, light_walk, endpoint, speed=0.5)
             with daemon(config, tmp_path / "notify") as process:
                 told = lambda: bool(table) and fleet.robots("room") and fleet.robots("room")[0].last_health is not None  # noqa: E731
@@ -128,7 +118,7 @@ def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts
     with MapStore.open(site.store, create=True) as store:
         robot_world.save(store)
         site.run("mapserver", "trust", "init", "--here", "--host", "127.0.0.1", "--store", site.store)
-        ride = write_walk(tmp_path / "ride", 900, range(100, 220))
+        ride = robot_world.write(tmp_path / "ride", robot_world.bundles(900, dark=range(100, 220)))
         (tmp_path / "rig.yaml").write_text(format_calibration(calibration()))
         with site.serving():
             site.enrol("r1")

@@ -55,10 +55,8 @@ def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
 
         there, name = urlsplit(served.http), f"{LAB}/inbox/ride.mcap"
         with socket.create_connection((there.hostname, there.port)) as cut:
-            cut.sendall(
-                f"PUT {name}?actor=ada HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n".encode()
-                + bytes(3_000_000)
-            )
+            head = f"PUT {name}?actor=ada HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n"
+            cut.sendall(head.encode() + bytes(3_000_000))
             assert eventually(lambda: any(path.stat().st_size for path in inbox.glob("lab/.ride.mcap.*")), 120.0)
         assert eventually(lambda: not list(inbox.glob("lab/*")) + list(inbox.glob("lab/.*")), 120.0)
         assert httpx.put(f"{served.http}{name}", params=ADA, content=pieces(ride)).status_code == 201

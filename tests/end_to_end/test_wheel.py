@@ -11,9 +11,9 @@ from zipfile import ZipFile
 
 import pytest
 
+from support.fleet.contracts_documents import REPOSITORY
 from support.room_site import RoomSite
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 
 pytestmark = pytest.mark.timeout(600)
@@ -53,9 +53,8 @@ def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert sum(name.endswith(".so") for name in names) == 1, "the core alone is compiled"
     assert "mapserver/docs/service.md" in names
-    assert {"fleetmap/_core.pyi", "fleetmap/py.typed", "locclient/py.typed", "fleetmap/data/vocabulary.fmvb"} <= set(
-        names
-    )
+    files = {"fleetmap/_core.pyi", "fleetmap/py.typed", "locclient/py.typed", "fleetmap/data/vocabulary.fmvb"}
+    assert files <= set(names)
 
 
 def test_robot_has_what_the_extra_client_asks_for_and_nothing_else(robot: Path) -> None:

@@ -25,14 +25,8 @@ from support.fleet.memory_bus import MemoryBus, MemoryHub, permits
 from support.waiting import eventually
 
 OWN, OTHERS = "fleetmap/hall/robots/a/", "fleetmap/hall/robots/b/"
-ACCESS = Access(
-    [
-        Holder("a.1", "hall", "a"),
-        Holder("b.1", "hall", "b"),
-        Holder("c.1.enrol", "hall", "c", Purpose.ENROL),
-        Holder("live.survey", purpose=Purpose.SURVEY),
-    ]
-)
+ROBOTS = Holder("a.1", "hall", "a"), Holder("b.1", "hall", "b"), Holder("c.1.enrol", "hall", "c", Purpose.ENROL)
+ACCESS = Access([*ROBOTS, Holder("live.survey", purpose=Purpose.SURVEY)])
 
 
 class Keys:
@@ -65,9 +59,8 @@ class World:
         stack.enter_context(self.server)
         self.heard: list[tuple[str, str]] = []  # what a publication holds, and its key
         for keys_of_all in ("robots/*/health", "live/*"):
-            self.server.subscribe(
-                f"fleetmap/*/{keys_of_all}", lambda key, said: self.heard.append((said.decode(), key))
-            )
+            heard = lambda key, said: self.heard.append((said.decode(), key))  # noqa: E731
+            self.server.subscribe(f"fleetmap/*/{keys_of_all}", heard)
         for what in ("robots/*/wanted", "blobs/*", "robots/*/blobs/*", "robots/*/renew"):
             self.server.queryable(f"fleetmap/*/{what}", lambda *_: b"honest")
 
@@ -145,10 +138,8 @@ def test_publications(make: Callable[[bool], World]) -> None:
         robots = {certificate: world.join(certificate) for certificate, _ in allowed | denied}
         world.settle()
         arriving: set[tuple[str, str]] = set()
-        for sent, arrives in (
-            (allowed, True),
-            (denied, not is_guarded),
-        ):  # zenoh may drop a batch with a denied one whole
+        # zenoh may drop a batch with a denied one whole
+        for sent, arrives in ((allowed, True), (denied, not is_guarded)):
             arriving |= sent if arrives else set()
             for certificate, key in sent:
                 robots[certificate].publish(key, certificate.encode())
@@ -302,13 +293,13 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
         assert good.get(OTHERS + "blobs/00ff") == b"honest"
         # The control: without TLS, or where it is not looked at who signed the server's certificate, the robot believes both.
         for how, robot in ((None, None), (keys.strangers.tls, TlsFiles(wrong_server.authority, stranger.own))):
-            there = Bus("tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0", is_server=True, tls=how).open()
-            fake = stack.enter_context(there)
+            endpoint = "tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0"
+            fake = stack.enter_context(Bus(endpoint, is_server=True, tls=how).open())
             fake.queryable("fleetmap/**", lambda *_: b"EVIL")
             victim = stack.enter_context(Bus(fake.endpoint, tls=robot).open())
             assert victim.get(OTHERS + "blobs/00ff") == b"EVIL"
     with pytest.raises(UnreachableError, match="nothing listens at"):
-        handshake_fault(endpoint, keys.robot("a.1"))
+        handshake_fault(world.server.endpoint, keys.robot("a.1"))
     late = Bus(with_free_port("tcp/127.0.0.1:0"), is_server=True)
     start = threading.Timer(0.3, late.open)
     start.start()
@@ -324,8 +315,7 @@ def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str)
     with Bus(f"{protocol}/127.0.0.1:0", is_server=True, tls=keys.ours.tls, access=ACCESS).open() as server:
         server.queryable("fleetmap/*/robots/*/wanted", lambda key, _: key.encode())
         server.subscribe("fleetmap/*/robots/*/health", lambda key, _: heard.append(key))
-        closed = server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"")
-        closed.close()
+        server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"").close()
         with (
             Bus(server.endpoint, tls=keys.robot("a.1")).open() as a,
             Bus(server.endpoint, tls=keys.robot("b.1")).open() as b,

@@ -3,16 +3,12 @@
 import shlex
 from importlib import metadata
 from types import SimpleNamespace
-from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
 
 from fleetmap.cli_exit import require_extra, run_cli, runnable
 from fleetmap.errors import GateRefusedError
-
-
-def failing(error: BaseException) -> None:
-    raise error
 
 
 @pytest.mark.parametrize(
@@ -27,14 +23,14 @@ def test_errors_become_messages(
     error: BaseException, status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
-        run_cli(lambda: failing(error))
+        run_cli(Mock(side_effect=error))
     assert end.value.code == status
     assert words in capsys.readouterr().err
 
 
 def test_a_module_of_our_own_that_is_missing_is_a_bug() -> None:
     with pytest.raises(ModuleNotFoundError):
-        run_cli(lambda: failing(ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
+        run_cli(Mock(side_effect=ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
 
 
 @pytest.mark.parametrize(
@@ -81,8 +77,5 @@ def test_a_program_whose_extra_is_missing_says_what_to_install(
 
 
 def test_a_source_tree_that_is_not_installed_is_asked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(name: str) -> NoReturn:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "distribution", none)
+    monkeypatch.setattr(metadata, "distribution", Mock(side_effect=metadata.PackageNotFoundError("fleetmap")))
     require_extra("server", "mapserver")

@@ -6,12 +6,11 @@ import inspect
 import operator
 import os
 import re
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -19,15 +18,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fleetmap import (  # type: ignore[attr-defined]
-    _core,  # type: ignore[attr-defined]
-    core,
-)
+from fleetmap import _core, core  # type: ignore[attr-defined]
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.settings import TrackerSettings
-from support.core_arguments import Arguments
+from support.core_arguments import MEMBERS, Arguments
 from support.fleet.contracts_documents import text
+from support.storage.memory_limit import memory_at_most
 
 MODULE = ast.parse(text("shared/fleetmap/_core.pyi")).body
 CONSTANTS = {ast.unparse(node.target) for node in MODULE if isinstance(node, ast.AnnAssign)}
@@ -87,16 +84,19 @@ def tracked(image: Array, pixels: Array) -> tuple[object, float]:
     held.begin(image)
     held.add(pixels)
     found, share = held.track(image[::-1].copy(), (image, image, image), None, np.eye(4), True, pixels)
-    return {name: getattr(found, name) for name in dir(found) if not name.startswith("_")}, share
+    return {name: getattr(found, name) for name in public(found)}, share
+
+
+def public(held: object) -> set[str]:
+    return {name for name in dir(held) if not name.startswith("_")}
 
 
 def test_the_stub_names_everything() -> None:
-    functions = {name for name in STUB if "." not in name}
-    assert functions | set(CLASSES) | CONSTANTS == {name for name in dir(_core) if not name.startswith("_")}
+    assert {name for name in STUB if "." not in name} | set(CLASSES) | CONSTANTS == public(_core)
     for name, held in CLASSES.items():
         members = {member.name for member in held.body if isinstance(member, ast.FunctionDef)} - {"__init__"}
         members |= {ast.unparse(member.target) for member in held.body if isinstance(member, ast.AnnAssign)}
-        assert members == {member for member in dir(getattr(_core, name)) if not member.startswith("_")}
+        assert members == public(getattr(_core, name))
 
 
 @pytest.mark.parametrize("name", STUB)
@@ -113,7 +113,6 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
         operator.attrgetter(name)(_core)(*[strange] * max(1, len(STUB[name].args.args)))
 
 
-DEPTH = np.ones((2, 2), np.float32)
 NO_FACES = np.zeros((0, 9)), np.zeros((0, 6), np.int32), np.zeros((0, 2), np.int32)
 UNLIT = np.ones((0, 5)), 1.0, True, np.zeros((1, 4), np.float32)
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
@@ -125,7 +124,6 @@ REFINEMENT = 4.0, 11.0, (10, 5)
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: core.descend(WORDS, WORDS, NUMBERS, NUMBERS + 5, NUMBERS), "children"),
         (lambda: core.descend(WORDS, WORDS[:0], NUMBERS[:0], NUMBERS[:0], NUMBERS[:0]), "root"),
         (lambda: core.BoxGrid(BOX, ZERO, np.array([1.0, 1.0, 5e3]), 1.0), "cell_m"),
         (lambda: core.BoxGrid(np.full((9, 8), 2e3), ZERO, np.array([256.0, 256.0, 256.0]), 1.0), "boxes"),
@@ -149,26 +147,20 @@ def test_what_cannot_be_is_refused(call: object, told: str) -> None:
 @pytest.mark.parametrize("strange", [np.nan, np.inf, 1e200, 0.0])
 @pytest.mark.parametrize("lens", [np.ones(8), np.ones(4)])
 def test_a_depth_image_of_strange_numbers_gives_values(strange: float, lens: Array) -> None:
-    points = np.full((4, 3), strange)
-    registered = core.register_depth(
-        DEPTH * np.float32(strange), points, np.eye(4), np.full(4, strange), lens * strange, strange, 9, 9
-    )
+    depth, rays, pinhole = np.full((2, 2), np.float32(strange)), np.full((4, 3), strange), np.full(4, strange)
+    registered = core.register_depth(depth, rays, np.eye(4), pinhole, lens * strange, strange, 9, 9)
     assert not registered.any(), "no depth that a planner would take for one"
 
 
 # Calls with places (4, 2) of any numbers, at which they read a noisy image.
 HOSTILE = {
-    "match_rows": lambda image, places: core.match_rows(
-        *[image] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0
-    ),
-    "match_rows, without a limit": lambda image, places: core.match_rows(
-        *[image] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0
-    ),
+    "match_rows": lambda image, places: core.match_rows(*[image] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0),
+    "match_rows, without a limit": lambda image, places: core.match_rows(*[image] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0),
     "follow_pixels": lambda image, places: core.follow_pixels(
         image, image[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
     ),
     "tracker": lambda image, places: tracked(image, np.column_stack([places, places[::-1, 0]])),
-}
+}  # fmt: skip
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
 ANY_MATCH = StereoSettings(
     min_correlation=-np.inf, uniqueness=np.inf, wide_half_px=7, narrow_half_px=7, agreement_px=np.inf
@@ -197,9 +189,8 @@ def test_products_are_rounded_before_they_are_added() -> None:
     numbers, points_cam, _ = core.discs_before(points, -points, cam_from_map, -9.0, 99.0, np.zeros(4), 9, 9)
     x, y, z = points[numbers].astype(np.float64).T
     assert len(numbers) > 1900
-    assert np.array_equal(
-        points_cam, np.stack([row[0] * x + row[1] * y + row[2] * z for row in cam_from_map[:3, :3]], axis=1)
-    )
+    rounded = np.transpose([row[0] * x + row[1] * y + row[2] * z for row in cam_from_map[:3, :3]])
+    assert np.array_equal(points_cam, rounded)
 
 
 @pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])
@@ -223,30 +214,26 @@ run_cli(start)
 # Nothing that Python hands to the compiled core harms the process: each call ends in values or a refusal, soon and in bounded memory.
 
 EXAMPLES = int(os.environ.get("FLEETMAP_HOSTILE_EXAMPLES", "6"))  # of each function; of a class, times its methods
-SANITIZED = "FLEETMAP_CORE" in os.environ
 SECONDS, BYTES = 5.0, 1 << 30  # the most that a call may take
-MEMBERS = {name: getattr(_core, name) for name in dir(_core) if not name.startswith("_")}
-CALLS = [name for name, member in MEMBERS.items() if callable(member)]
 
 
 def bounded(function: Callable[..., object], arguments: list[object]) -> object:
     """The result, or None where it was refused."""
-    started, before = time.process_time(), resource.getrlimit(resource.RLIMIT_AS)
-    if not SANITIZED:  # whose memory is shadowed; there ASAN_OPTIONS limits the allocations
-        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (held + BYTES, before[1]))
+    started = time.process_time()
+    # Of a sanitized core memory is shadowed; there ASAN_OPTIONS limits the allocations.
+    limit = nullcontext() if "FLEETMAP_CORE" in os.environ else memory_at_most(BYTES)
     faulthandler.dump_traceback_later(20 * SECONDS, exit=True)
     try:
-        return function(*arguments)
+        with limit:
+            return function(*arguments)
     except (ValueError, TypeError):
         return None
     finally:
         faulthandler.cancel_dump_traceback_later()
-        resource.setrlimit(resource.RLIMIT_AS, before)
         assert time.process_time() - started < SECONDS
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", MEMBERS)
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=EXAMPLES, database=None)
 def test_every_call_ends_in_values_or_a_refusal(name: str, seed: int) -> None:
@@ -257,9 +244,8 @@ def test_every_call_ends_in_values_or_a_refusal(name: str, seed: int) -> None:
     held = bounded(member, arguments.of(member.__init__))
     if held is None:
         return
-    methods = [method for method in dir(member) if not method.startswith("_")]
+    methods = sorted(public(member))
     for method in arguments.rng.choice(methods, len(methods)):
-        if callable(getattr(member, method)):
-            bounded(getattr(held, method), arguments.of(getattr(member, method)))
-        else:
-            getattr(held, method)
+        found = getattr(held, method)
+        if callable(found):
+            bounded(found, arguments.of(getattr(member, method)))

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from fleetmap import failure_definition
-from fleetmap.failure_definition import (
-    is_blind,
-    is_driving,
-    is_found,
-    is_outside_bound,
-    is_usable,
-    radius_95_m,
-)
+from fleetmap.failure_definition import is_blind, is_driving, is_found, is_outside_bound, is_usable, radius_95_m
 from fleetmap.messages import Status
 
 
@@ -33,9 +26,8 @@ def test_a_speed_that_nobody_knows_is_driving() -> None:
 def test_a_fix_finds_the_robot_only_with_a_position_to_rely_upon() -> None:
     assert is_found(True, False, "TRACKING", 0.1)
     assert is_found(False, True, "DEGRADED", 0.1)
-    assert not is_found(False, True, "DEGRADED", 0.4)
-    assert not is_found(False, True, "INITIALISING", 0.1)
-    assert not is_found(False, False, "DEGRADED", 0.1)
+    unusable = (True, "DEGRADED", 0.4), (True, "INITIALISING", 0.1), (False, "DEGRADED", 0.1)
+    assert not any(is_found(False, *said) for said in unusable)
 
 
 def test_bounds_hold_what_they_say() -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -45,10 +46,7 @@ def test_every_name_is_there(package: str) -> None:
 
 
 def test_version_without_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> str:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "version", missing)
+    monkeypatch.setattr(metadata, "version", Mock(side_effect=metadata.PackageNotFoundError("fleetmap")))
     monkeypatch.delitem(sys.modules, "fleetmap.version", raising=False)
     assert fleetmap.__version__ == "0+source"
 

@@ -1,5 +1,7 @@
 """Messages of robots and server."""
 
+from functools import partial
+
 import msgspec
 import numpy as np
 import pytest
@@ -40,13 +42,9 @@ def test_a_report_of_a_failure_fits_a_message_with_all_its_pictures() -> None:
     data = encode_message(full)
     assert len(data) < MAX_MESSAGE_BYTES // 2
     assert decode_message(data, FailureReport) == full
+    large = Thumbnail(stamp_ns=1, kind="frame", jpeg=bytes(100_000))
     with pytest.raises(LinkError, match="jpeg"):
-        decode_message(
-            encode_message(
-                msgspec.structs.replace(full, thumbnails=(Thumbnail(stamp_ns=1, kind="frame", jpeg=bytes(100_000)),))
-            ),
-            FailureReport,
-        )
+        decode_message(encode_message(msgspec.structs.replace(full, thumbnails=(large,))), FailureReport)
 
 
 def test_poses_keep_their_transform() -> None:
@@ -85,9 +83,9 @@ def test_keys_can_be_taken_apart() -> None:
 
 def test_enums_are_text_on_the_wire() -> None:
     """The bytes are those of plain text, and what a newer robot says that this version does not know arrives as it is."""
-    health = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status=Status.LOST, flags=(Cause.DARK,))
-    plain = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status="LOST", flags=("dark",))
+    of = partial(RobotHealth, site="hall", robot="r", stamp_ns=1, version=None)
+    health, plain = of(status=Status.LOST, flags=(Cause.DARK,)), of(status="LOST", flags=("dark",))
     assert encode_message(health) == encode_message(plain)
     assert to_plain(health) == to_plain(plain)
-    newer = RobotHealth(site="hall", robot="r", stamp_ns=1, version=None, status="HOVERING")
+    newer = of(status="HOVERING")
     assert decode_message(encode_message(newer), RobotHealth).status == "HOVERING"

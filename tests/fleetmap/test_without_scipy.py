@@ -27,7 +27,6 @@ print("status", estimate.status)
 
 def test_odometry_needs_no_scipy() -> None:
     """Flow, descriptors after a gap, start in motion and filter updates, in a process where scipy cannot be imported."""
-    said = subprocess.check_output(
-        [sys.executable, "-c", SCRIPT], cwd=Path(__file__).parents[1], text=True, timeout=240
-    )
+    command = [sys.executable, "-c", SCRIPT]
+    said = subprocess.check_output(command, cwd=Path(__file__).parents[1], text=True, timeout=240)
     assert "status tracking" in said

@@ -3,7 +3,6 @@
 import shlex
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -15,6 +14,7 @@ from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.tls_site import START_S, TlsSite, forgotten_files
 from support.fleet.unit_filter import filtered
 from support.recordings.recording_samples import calibration, write_mcap
+from support.waiting import eventually
 from support.worlds import robot_world
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -41,10 +41,8 @@ class UnitSite(TlsSite):
 @pytest.mark.parametrize("unit", sorted(DEPLOY.glob("*.service")), ids=lambda path: path.stem)
 def test_the_filters_are_there(unit: Path) -> None:
     program = [sys.executable, "-c", FORBIDDEN]
-    free, bound = (
-        subprocess.run(words, capture_output=True, text=True, check=False)
-        for words in (program, filtered(unit, program))
-    )
+    commands = program, filtered(unit, program)
+    free, bound = (subprocess.run(words, capture_output=True, text=True, check=False) for words in commands)
     netlink = [] if "AF_NETLINK" in unit.read_text("utf-8") else ["97"]  # by which ROS lists interfaces
     assert (free.stdout.splitlines()[:-1], bound.stdout.splitlines()) == ([], [*netlink, "1", "-1"]), bound.stderr
 
@@ -52,8 +50,7 @@ def test_the_filters_are_there(unit: Path) -> None:
 @pytest.mark.timeout(600)
 def test_the_programs_do_their_work_under_the_filters_of_their_units(tmp_path: Path) -> None:
     site = UnitSite(tmp_path, "room")
-    with MapStore.open(site.store, create=True) as store:
-        robot_world.save(store)
+    with MapStore.open(robot_world.stored(site.store)) as store:
         site.run("mapserver", "trust", "init", "--here", "--host", "127.0.0.1", "--store", site.store)
         ride = robot_world.write(tmp_path / "ride", robot_world.bundles(400, dark=range(100, 180)))
         (tmp_path / "rig.yaml").write_text(format_calibration(calibration()))
@@ -62,10 +59,9 @@ def test_the_programs_do_their_work_under_the_filters_of_their_units(tmp_path: P
             site.enrol("r1")
             site.configure("r1", f'kind = "recording"\nrecording = "{ride}"\ncalibration = "{tmp_path}/rig.yaml"')
             with site.daemon("r1") as process:
-                give_up_s = time.monotonic() + START_S
-                while not store.fleet.failures(FailureFilter(site="room")) and time.monotonic() < give_up_s:
-                    assert process.poll() is None, site.log("r1").read_text()
-                    time.sleep(0.2)
+                has_failed = lambda: bool(store.fleet.failures(FailureFilter(site="room")))  # noqa: E731
+                assert eventually(lambda: has_failed() or process.poll() is not None, START_S)
+                assert process.poll() is None, site.log("r1").read_text()
                 process.terminate()
                 assert process.wait(30) == 0
             assert httpx.get(f"{site.http}/readyz").status_code == 200

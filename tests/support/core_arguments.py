@@ -87,15 +87,12 @@ class Arguments:
 
     def of(self, function: object) -> list[object]:
         words = {
-            "array": self.array,
-            "whole": self.integer,
-            "real": self.real,
+            "array": self.array, "whole": self.integer, "real": self.real, "rows": self.rows,
             "some": lambda: bool(self.rng.random() < 0.5),
             "several": lambda *parts: tuple(None if self.malice and self.is_odd() else part for part in parts),
-            "rows": self.rows,
             "thrice": lambda one: [one] * 3,
             "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, SETTINGS),
-        }
+        }  # fmt: skip
         made: list[object] = []
         for self.name, code in asked(function):
             made.append(eval(code, words))
@@ -129,16 +126,14 @@ def asked(function: object) -> list[tuple[str, CodeType]]:
     return [(name, compile(kind.partition(" = ")[0], name, "eval")) for name, _, kind in arguments]
 
 
-MEMBERS = {
-    name: getattr(_core, name) for name in dir(_core) if not name.startswith("_") and callable(getattr(_core, name))
-}
-CALLS = {name for name, member in MEMBERS.items() if not isinstance(member, type)} | {
-    f"{name}.{method}"
-    for name, member in MEMBERS.items()
-    if isinstance(member, type)
-    for method in dir(member)
-    if (method == "__init__" or not method.startswith("_")) and callable(getattr(member, method))
-}
+def callables(held: object) -> dict[str, Any]:
+    names = (name for name in dir(held) if name == "__init__" or not name.startswith("_"))
+    return {name: getattr(held, name) for name in names if callable(getattr(held, name))}
+
+
+MEMBERS = callables(_core)
+CLASSES = {name: member for name, member in MEMBERS.items() if isinstance(member, type)}
+CALLS = MEMBERS.keys() - CLASSES | {f"{name}.{method}" for name, kind in CLASSES.items() for method in callables(kind)}
 NUMBER, SINGLES = np.zeros(1, np.int32), np.ones((5, 3), np.float32)
 CONES, WORDS = (np.ones((5, 3)), SINGLES, SINGLES[:, 0].copy(), SINGLES[:, 0].copy()), np.zeros((5, 4), np.uint64)
 QUADS, SIXES, FACES = np.ones((0, 9)), np.zeros((0, 6)), np.zeros((0, 6), np.int32)
