@@ -11,31 +11,13 @@ from typing import TypeVar
 
 import msgspec
 
+from fleetmap import errors, messages
 from fleetmap.bus.endpoints import is_loopback
 from fleetmap.bus.zenoh_bus import Bus, Handle
-from fleetmap.errors import (
-    LinkError,
-    MapFormatError,
-    StoreError,
-    UnreachableError,
-    UntrustedError,
-    UsageError,
-    disk_errors,
-)
+from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UsageError, disk_errors
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest
 from fleetmap.mapformat.names import check_name, sha256_hex, verified
-from fleetmap.messages import (
-    PART_BYTES,
-    ChunkRequest,
-    FailureAck,
-    Part,
-    RobotAck,
-    SurveyArea,
-    WantedVersion,
-    decode_message,
-    encode_message,
-    robot_key,
-)
+from fleetmap.messages import PART_BYTES, FailureAck, Part, RobotAck, WantedVersion, decode_message, encode_message
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from fleetmap.version_grid import grid_blobs
 from locclient.identity import MapAddress
@@ -82,7 +64,7 @@ class ChunkReader:
             raise
 
     def _chunk(self, key: str, offset: int, max_bytes: int) -> Part:
-        chunk = self._request(key, encode_message(ChunkRequest(offset=offset)))
+        chunk = self._request(key, encode_message(messages.ChunkRequest(offset=offset)))
         self.received_bytes += len(chunk.data)
         if chunk.total_bytes > max_bytes:
             raise LinkError(f"{key} has {chunk.total_bytes} bytes where at most {max_bytes} are expected")
@@ -126,7 +108,7 @@ class MapClient(map_source.MapSource):
         self.trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
         self._brought: WantedVersion | None = None  # since the start, with all that this robot takes
-        self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
+        self.surveys: tuple[messages.SurveyArea, ...] = ()  # that robots may make, by its last answer
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._begun = ""  # the manifest's address of the version that was admitted last
 
@@ -182,7 +164,7 @@ class MapClient(map_source.MapSource):
             return active
         try:
             if self.trust is None:
-                raise UntrustedError("signature", "this robot has no signed lists")
+                raise errors.UntrustedError("signature", "this robot has no signed lists")
             wanted = self.trust.current()
             # An active version may have come before planners needed grids, or without its own.
             if wanted != (self._brought if self.takes_grids else active):
@@ -302,7 +284,7 @@ class MapClient(map_source.MapSource):
         self.bus.publish(self._key(name), encode_message(message), may_drop=may_drop)
 
     def _key(self, name: str) -> str:
-        return robot_key(self.site, self.robot, name)
+        return messages.robot_key(self.site, self.robot, name)
 
 
 def open_bus(address: MapAddress) -> Bus:

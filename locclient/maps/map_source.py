@@ -9,16 +9,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fleetmap import errors
 from fleetmap.bow.vocabulary import decode_vocabulary, shipped_vocabulary
-from fleetmap.errors import (
-    FleetmapError,
-    LinkError,
-    MapFormatError,
-    StoreError,
-    UnreachableError,
-    UsageError,
-    disk_errors,
-)
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UsageError
 from fleetmap.mapformat.manifest import Manifest, TileEntry, decode_manifest
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, verified
 from fleetmap.mapformat.tile import Tile, decode_tile
@@ -172,7 +165,7 @@ class LocalMapSource(MapSource):
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """Return the verified bytes of an address; StoreError for missing ones, MapFormatError for damaged ones."""
         path = self._folder / blob_path(sha256)
-        with disk_errors(f"{path} cannot be read", "the store is incomplete"):
+        with errors.disk_errors(f"{path} cannot be read", "the store is incomplete"):
             return verified(path.read_bytes(), sha256)
 
 

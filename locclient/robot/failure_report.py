@@ -7,28 +7,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import messages
 from fleetmap.failure_definition import known_radius_m
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, Indices, se3_inverse
 from fleetmap.mapformat.tile import Tile
-from fleetmap.messages import (
-    MAX_THUMBNAIL_BYTES,
-    CameraNote,
-    Cause,
-    FailureEvidence,
-    FailureReport,
-    Placement,
-    Thumbnail,
-)
+from fleetmap.messages import CameraNote, Cause, FailureEvidence, FailureReport, Placement, Thumbnail
 from fleetmap.recordings.images import jpeg_image
-from fleetmap.relocalization.map_view import (
-    COLUMNS,
-    ROWS,
-    cones_of_tiles,
-    image_cells,
-    match_visible,
-    visible_landmarks,
-)
+from fleetmap.relocalization import map_view
+from fleetmap.relocalization.map_view import cones_of_tiles, image_cells, match_visible, visible_landmarks
 from fleetmap.sensors.rectification import MountedRig, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.localization.estimate import Hypothesis
@@ -211,7 +198,7 @@ def _evidence(
         others = [Hypothesis(estimate.map_from_body, AGREEING_FIXES, estimate.floor, recall)]
     places = [(*np.round(100.0 * h.map_from_body[:2, 3]), h.support, round(100.0 * h.recall)) for h in others[:_PLACES]]
     return FailureEvidence(
-        view_percent=round(100.0 * len(np.unique(covered)) / (COLUMNS * ROWS)),
+        view_percent=round(100.0 * len(np.unique(covered)) / (map_view.COLUMNS * map_view.ROWS)),
         usual_percent=round(100.0 * context.evidence.usual_recall),
         cells=tuple((x, y, expected, seen) for x, y, expected, seen in cells.tolist()),
         places=tuple((int(x), int(y), *rest) for x, y, *rest in places) if estimate.is_at_home else (),
@@ -251,4 +238,4 @@ def _thumbnails(
 
 
 def _thumbnail(stamp_ns: int, kind: str, image: NDArray[np.uint8], width_px: int) -> Thumbnail:
-    return Thumbnail(stamp_ns=stamp_ns, kind=kind, jpeg=small_jpeg(image, width_px, MAX_THUMBNAIL_BYTES))
+    return Thumbnail(stamp_ns=stamp_ns, kind=kind, jpeg=small_jpeg(image, width_px, messages.MAX_THUMBNAIL_BYTES))

@@ -15,20 +15,12 @@ from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
+from mapserver.calibration import parameters
 from mapserver.calibration.motion_rows import CalibrationData, MotionState
-from mapserver.calibration.parameters import (
-    COLUMNS,
-    DISTORTION,
-    INDEX,
-    UNKNOWNS,
-    CalibrationParameter,
-    RigAxes,
-    corrected_rig,
-    right_camera,
-)
+from mapserver.calibration.parameters import COLUMNS, DISTORTION, INDEX, UNKNOWNS, RigAxes, corrected_rig, right_camera
 from mapserver.survey.bundle.problem import ImageRows
 
-P = CalibrationParameter
+P = parameters.CalibrationParameter
 _STEP_PX = 0.1  # of the numerical derivative of raw by rectified pixels
 # Columns of the distortion of both lenses, and of their difference; those that move what the left lens measures
 _BOTH = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)

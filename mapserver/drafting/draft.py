@@ -22,15 +22,9 @@ from fleetmap.mapformat.tile import Tile
 from fleetmap.recordings import Recording, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
+from mapserver.drafting import draft_evidence, survey_recordings
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
-from mapserver.drafting.draft_evidence import (
-    Before,
-    MappedSession,
-    TileChooser,
-    asked_views,
-    examine_draft,
-    replayed_probes,
-)
+from mapserver.drafting.draft_evidence import Before, MappedSession
 from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
@@ -45,19 +39,7 @@ from mapserver.drafting.report import (
     sentence,
     write_file,
 )
-from mapserver.drafting.survey_recordings import (
-    Admission,
-    OpenRecordings,
-    RecordingOptions,
-    RecordingSurvey,
-    admit_recordings,
-    joined_truth,
-    map_trajectories,
-    read_zones,
-    say_left_out,
-    survey_all,
-    survey_recording,
-)
+from mapserver.drafting.survey_recordings import Admission, OpenRecordings
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import accuracy, truth_from_estimate
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged, pair_yaws
@@ -76,7 +58,7 @@ _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "s
 
 
 @dataclass(frozen=True, slots=True)
-class BuildOptions(RecordingOptions):
+class BuildOptions(survey_recordings.RecordingOptions):
     """Options of a build, beside those of reading. Files without a name are not written.
 
     trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
@@ -160,7 +142,7 @@ def build_draft(
     options, times = request.options, StageTimes(time.perf_counter)
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
         raise UsageError(f"{given.file} is for one recording, {len(request.recordings)} are named; build each alone")
-    zones = read_zones(options.zones)
+    zones = survey_recordings.read_zones(options.zones)
     console = plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
     reads = OpenRecordings(options, folder, request.first)
@@ -168,7 +150,7 @@ def build_draft(
         run = _Run(request, reading, settings, zones, unusable, console, times, images)
         times.begin("examination")
         with run.tools() as tools:
-            admitted = admit_recordings(
+            admitted = survey_recordings.admit_recordings(
                 request.recordings,
                 reading,
                 console,
@@ -228,18 +210,20 @@ def _survey(
     survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
     with run.tools(options.scheduler, told) as tools:
 
-        def survey_one(path: Path, pinhole: StereoCamera | None) -> list[RecordingSurvey]:
+        def survey_one(path: Path, pinhole: StereoCamera | None) -> list[survey_recordings.RecordingSurvey]:
             options.look_at([path])
-            return survey_recording(path, admitted.pop(path), run.reading, pinhole, survey_options, tools)
+            return survey_recordings.survey_recording(
+                path, admitted.pop(path), run.reading, pinhole, survey_options, tools
+            )
 
         paths = list(admitted)
-        surveyed = survey_all(paths, survey_one, None if base is None else base.camera, run.unusable)
+        surveyed = survey_recordings.survey_all(paths, survey_one, None if base is None else base.camera, run.unusable)
         options.look_at(paths)
         tools.progress("joining", 0, 1)
         joined, corrections = corrections.joined(base, surveyed, settings)
     run.times.begin("storing")
-    say_left_out(run.console, run.request.site, surveyed, joined)
-    truth = joined_truth(surveyed, joined)
+    survey_recordings.say_left_out(run.console, run.request.site, surveyed, joined)
+    truth = survey_recordings.joined_truth(surveyed, joined)
     estimate = joined.map.estimated_trajectory
     found = accuracy(estimate, len(joined.map.trajectory), truth, joined.map.keyframe_stamps_ns)
     if options.frame_from_ground_truth:
@@ -257,13 +241,13 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     site, survey_map = run.request.site, built.joined.map
     sessions = [
         MappedSession(trajectory, s.probed, s.survey, s.entry.name)
-        for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
+        for trajectory, s in zip(survey_recordings.map_trajectories(built.joined), built.taken, strict=True)
     ]
     run.times.begin("choosing")
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     frozen = built.corrections.frozen(survey_map.points_map)
-    chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
-    tiles, views = chooser.choose(asked_views(sessions))
+    chooser = draft_evidence.TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
+    tiles, views = chooser.choose(draft_evidence.asked_views(sessions))
     run.times.begin("extras")
     before = None if parent is None else parent.manifest
     chosen, stages = ChosenDraft(sessions, run.settings, built.corrections, before, maps), plugins("mapserver.stages")
@@ -339,9 +323,11 @@ def _evidence(
     replayed = []
     if before is not None:
         opened = replace(options, trajectory=None).opened
-        replayed = replayed_probes(options.replay, before, opened, (camera, run.settings.orb))
+        replayed = draft_evidence.replayed_probes(options.replay, before, opened, (camera, run.settings.orb))
     with open_executor(options.threads, None) as executor:
-        evidence = examine_draft(tiles, default_vocabulary(), camera, before, sessions, replayed, executor)
+        evidence = draft_evidence.examine_draft(
+            tiles, default_vocabulary(), camera, before, sessions, replayed, executor
+        )
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
 

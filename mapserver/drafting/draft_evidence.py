@@ -25,20 +25,11 @@ from fleetmap.relocalization.relocalizer import Fix, FrameFeatures, is_reliable
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
+from mapserver.quality import probes as probing
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, displaced, examine, trajectory_breaks
 from mapserver.quality.figures import BlindView, Evidence, RigEvidence, SurveyedViews, TrajectoryBreaks
-from mapserver.quality.probes import (
-    PRIOR_RADIUS_M,
-    SAME_WAY_COSINE,
-    Probe,
-    anywhere,
-    place_xy,
-    probe_features,
-    probes_of_map,
-    relocalized,
-    spread,
-)
+from mapserver.quality.probes import Probe, anywhere, place_xy, relocalized, spread
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.rig import frame_of_camera, used_cameras
@@ -132,7 +123,9 @@ def _read(
                 continue
             if (seen := frame_of_camera(frame, view)) is not None:
                 camera, body_from_cam = rectifier.mounted[view]
-                found.append(ProbedFrame(number, camera, body_from_cam, probe_features(seen, camera, orb), view=view))
+                found.append(
+                    ProbedFrame(number, camera, body_from_cam, probing.probe_features(seen, camera, orb), view=view)
+                )
     return found
 
 
@@ -204,7 +197,7 @@ class TileChooser(NamedTuple):
         """Return the matches of a probe among all landmarks that were observed around it; None without a fix at its place."""
         survey = self.survey_map
         map_from_cam = survey.map_from_body @ survey.body_from_cam
-        near = places_around(map_from_cam, probe.map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
+        near = places_around(map_from_cam, probe.map_from_cam, probing.PRIOR_RADIUS_M, probing.SAME_WAY_COSINE)
         around = np.zeros(len(survey.landmark_ids), bool)
         around[survey.obs_landmark[near[survey.obs_keyframe]]] = True
         view = self._view(tiles_from_survey(survey, chosen=around))
@@ -326,7 +319,7 @@ def examine_draft(
     """Return the findings of probes in the tiles as stored; camera: that of the map; sessions: its recordings."""
     held_out = [probe for session in sessions for probe in session.probes(session.judging(len(sessions)))]
     stored = _as_stored(tiles)
-    probes = Probes(held_out, replayed, [] if before is None else probes_of_map(before.survey, PROBES))
+    probes = Probes(held_out, replayed, [] if before is None else probing.probes_of_map(before.survey, PROBES))
     current = None if before is None else MapView(before.tiles, vocabulary, before.survey.camera.focal_px)
     draft = MapView(stored, vocabulary, camera.focal_px)
     removed_ids = None if before is None else before.removed_ids

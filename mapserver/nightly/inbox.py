@@ -23,15 +23,8 @@ from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple
 
-from fleetmap.errors import (
-    FleetmapError,
-    InvalidValueError,
-    RecordingError,
-    StateError,
-    StoreError,
-    UsageError,
-    disk_errors,
-)
+from fleetmap import errors
+from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
@@ -290,7 +283,7 @@ def check_upload_name(inbox: Path, name: str) -> Path:
     if not is_short or path.suffix not in suffixes:
         known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_UPLOAD_NAME_BYTES} bytes that end in {known}"
-        raise InvalidValueError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
+        raise errors.InvalidValueError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
     if os.path.lexists(path):
         raise StateError(f"the inbox has a recording {name} already; rename one of them")
     return path

@@ -11,17 +11,9 @@ from fleetmap.geometry import Array, Mask, rotation_angle_rad, se3_inverse, tran
 from fleetmap.relocalization.map_view import MapView, places_around
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
+from mapserver.quality import probes as probing
 from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import (
-    PRIOR_RADIUS_M,
-    SAME_WAY_COSINE,
-    Probe,
-    ProbeFixes,
-    fixes_of,
-    fixes_with_prior,
-    repetition,
-    starts_without_prior,
-)
+from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, ProbeFixes
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.merge.session_alignment import count_places
 from mapserver.survey.settings import SessionSettings
@@ -55,9 +47,9 @@ def examine(
     removed_ids: landmarks of the current version that operators' corrections removed from the draft; None for none.
     """
     frames, keyframes = [*probes.held_out, *probes.replayed], probes.last_version
-    now = list(executor.map(fixes_of, draft, frames))
-    now += executor.map(fixes_with_prior if frames else fixes_of, draft, keyframes)
-    then = None if before is None else list(executor.map(fixes_with_prior, before, [*frames, *keyframes]))
+    now = list(executor.map(probing.fixes_of, draft, frames))
+    now += executor.map(probing.fixes_with_prior if frames else probing.fixes_of, draft, keyframes)
+    then = None if before is None else list(executor.map(probing.fixes_with_prior, before, [*frames, *keyframes]))
     # Those localised in either: a draft cannot lose positions unknown to robots, and with only those of the current version all its
     # chance localisations would count against the draft.
     found = [[fixes[n].near for fixes in (now, then) if fixes is not None] for n in range(len(now))]
@@ -76,8 +68,8 @@ def examine(
         aliasing=aliasing(now[asked]),
         aliasing_before=None if then is None else aliasing(then[asked]),
         motion=motion,
-        starts=starts_without_prior(now[asked]),
-        repetition=repetition(now[asked]),
+        starts=probing.starts_without_prior(now[asked]),
+        repetition=probing.repetition(now[asked]),
     )
 
 

@@ -10,14 +10,8 @@ from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.mapformat.manifest import Manifest
-from mapserver.quality.figures import (
-    Aliasing,
-    Comparison,
-    Displacement,
-    Evidence,
-    TrajectoryBreaks,
-    trusted_calibrations,
-)
+from mapserver.quality import figures
+from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, TrajectoryBreaks
 
 CHECKS = {
     "joining": "recordings that belong to the site",
@@ -189,7 +183,7 @@ def _calibration_reasons(
     """Return doubts, for an operator; parts of a first map never judged, the reference of later ones; other unknown parts."""
     if examined.calibrations is None:
         return [], [], ["calibration"]
-    trusted = {choice.rig: choice for choice in trusted_calibrations(draft)}
+    trusted = {choice.rig: choice for choice in figures.trusted_calibrations(draft)}
     doubts, unjudged, unknown = list[str](), list[str](), list[str]()
     for rig in examined.calibrations:
         doubts += [f"calibration {rig.rig}: {subject}: {words}" for subject, words in rig.doubted.items()]

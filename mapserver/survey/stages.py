@@ -28,27 +28,15 @@ from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import Culled, assemble
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.loops.connected_components import (
-    Component,
-    between_kept,
-    find_components,
-    find_groups,
-    only_kept,
-    sigma_between,
-    without_doubted,
-)
+from mapserver.survey.loops import connected_components
+from mapserver.survey.loops.connected_components import Component
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.odometry_pass import initial_state, poses_as_odometry, run_odometry
+from mapserver.survey.pose_graph import position_priors
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges, odometry_factors
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from mapserver.survey.pose_graph.position_priors import (
-    judged_priors,
-    learn_priors,
-    level,
-    placed_by_priors,
-    prior_edges,
-)
+from mapserver.survey.pose_graph.position_priors import placed_by_priors, prior_edges
 from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_scaled
 from mapserver.survey.rig import rig_of
 from mapserver.survey.segments import in_segments
@@ -113,15 +101,17 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
         known = chain.matched, Tracks.of(state.landmarks, image_numbers(len(state.stamps_ns), len(rig)))
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     state = replace(state, landmarks=Landmarks.empty(), rig=rig)
-    chain = replace(chain, odometry=without_doubted(chain.odometry, loops.doubted), state=state)
+    chain = replace(chain, odometry=connected_components.without_doubted(chain.odometry, loops.doubted), state=state)
     odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools, inputs.pair_yaw)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
-    components = find_components(state, sigma_between(odometry), settings.join_sigma_m)
-    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
+    components = connected_components.find_components(
+        state, connected_components.sigma_between(odometry), settings.join_sigma_m
+    )
+    state, odometry, loops = connected_components.only_kept(state, odometry, loops, components.kept)
     placed = place_frames(odometry, state, settings, stereo_yaws[0].correction_px, tools.executor)
     survey_map, rows, culled = assemble(state, odometry, placed, settings)
-    between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
+    between = connected_components.between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
     return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaws, every, placed.seen)
@@ -187,8 +177,10 @@ def close_loops(
         base_from_body = inputs.calibration.base_from_body
         placed, terms = placed_by_priors(state.map_from_body, marginals, inputs.priors, base_from_body, odometry)
         marginals = GraphMarginals(placed, known)
-        state = replace(state.moved(placed), priors=learn_priors(marginals, terms))
-    groups = find_groups(state, sigma_between(odometry), settings.join_sigma_m)
+        state = replace(state.moved(placed), priors=position_priors.learn_priors(marginals, terms))
+    groups = connected_components.find_groups(
+        state, connected_components.sigma_between(odometry), settings.join_sigma_m
+    )
     posed = _posed(odometry, replace(state, rig=rig_of(inputs.rectifier)))
     closer = LoopCloser(
         posed,
@@ -197,7 +189,7 @@ def close_loops(
         begun.matched,
         groups,
         tools.executor,
-        find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
+        connected_components.find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
         measures_scale=not odometry.scale_known,
     )
     for i in range(len(posed.images)):
@@ -224,7 +216,7 @@ def _solved(state: SurveyState, map_from_body: Array, chain: list[PoseEdge], loo
         return state.moved(solved.map_from_body), loops.without_outliers(solved.loop_weights)
     nodes, held = prior_edges(map_from_body, [state.priors[n] for n in believed])
     solved = optimize_pose_graph(nodes, [*chain, *loops.edges, *held])
-    new_from_map = level(se3_inverse(solved.map_from_body[-1]), state.priors[believed[0]].map_from_body)
+    new_from_map = position_priors.level(se3_inverse(solved.map_from_body[-1]), state.priors[believed[0]].map_from_body)
     weights = dict(zip(believed, solved.loop_weights[len(loops.edges) :] >= 0.5, strict=True))
     priors = [replace(term, is_believed=bool(weights.get(n, False))) for n, term in enumerate(state.priors)]
     state = replace(state.moved(new_from_map @ solved.map_from_body[:-1]), priors=priors)
@@ -308,7 +300,7 @@ def _adjusted(
     """Return the adjusted state; priors that contradict it are then no longer believed."""
     tools.images.release()
     state = adjust_visits(state, settings, redundant, rounds)
-    priors, same = judged_priors(state.priors, state.map_from_body)
+    priors, same = position_priors.judged_priors(state.priors, state.map_from_body)
     return state if same else adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
 
 

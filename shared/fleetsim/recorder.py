@@ -17,27 +17,13 @@ from fleetmap.recordings.images import StoredFrame, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetsim import sensors
 from fleetsim.motion import CarriedMotion, Motion, RouteMotion, check_clear
 from fleetsim.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import LIGHT_STATES, World
-from fleetsim.sensors import (
-    LATE_S,
-    Fault,
-    FaultPlan,
-    HiddenErrors,
-    RobotKind,
-    measure_depth,
-    measure_imu,
-    measure_priors,
-    measure_wheels,
-    nominal_calibration,
-    sample_times,
-    stamps_from_s,
-    true_calibration,
-)
 
 _TRUTH_STEP_S = 0.02
 _SEEDS_PER_STOREY = 1 << 20
@@ -58,9 +44,9 @@ class Order:
     robot: str | None = None
     lens: str | None = None
     frames: int | None = None
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[sensors.Fault, ...] = ()
     size_px: tuple[int, int] | None = None
-    hidden: HiddenErrors = field(default_factory=HiddenErrors)
+    hidden: sensors.HiddenErrors = field(default_factory=sensors.HiddenErrors)
     camera_pipeline: str = "clean"
     rig: str = "pair"
 
@@ -91,7 +77,7 @@ class Session:
                 camera, measured_m = self.nominal.cameras[first], None
                 if camera.has_depth:
                     rng = np.random.default_rng([self.order.seed, stamp_ns, len(frames) - 1])
-                    measured_m = measure_depth(shots[first].depth_m, camera, rng)
+                    measured_m = sensors.measure_depth(shots[first].depth_m, camera, rng)
                 right = shots[second[0]].image if second else None
                 frames.append(CameraFrame(stamp_ns, shots[first].image, right, measured_m))
             return process_frame(replace(frames[0], others=tuple(frames[1:])), pipeline, self.order.seed)
@@ -107,8 +93,8 @@ class Session:
     def frame_stamps_ns(self) -> list[int]:
         """Stamps of the frames, with late frames and the rig's hidden delay."""
         delay_s, plan = self.renderer.imu_minus_cam_s, self.renderer.faults
-        shifted = [t - delay_s + (LATE_S if plan.has("frames-late", t) else 0.0) for t in self.frame_times_s]
-        return [int(stamp) for stamp in stamps_from_s(np.array(shifted))]
+        shifted = [t - delay_s + (sensors.LATE_S if plan.has("frames-late", t) else 0.0) for t in self.frame_times_s]
+        return [int(stamp) for stamp in sensors.stamps_from_s(np.array(shifted))]
 
 
 def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
@@ -116,11 +102,11 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng([order.seed, order.day, zlib.crc32(robot.encode()), zlib.crc32(purpose.encode())])
 
 
-def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
+def drive(run: Run, kind: sensors.RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
     """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
     motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces, rides=len(run.storeys) > 1)
-    check_clear(motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], layout, kind.clearance_m)
+    check_clear(motion.map_from_body(sensors.sample_times(motion.duration_s, 20.0))[:, :2, 3], layout, kind.clearance_m)
     return motion
 
 
@@ -135,13 +121,16 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     kind = replace(run.kind, lens=order.lens or run.kind.lens, rig=order.rig, hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
-    nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
+    nominal, true = (
+        sensors.nominal_calibration(kind),
+        sensors.true_calibration(kind, _generator(order, name, "mounting")),
+    )
     motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
     rides_s = motion.rides_s if isinstance(motion, CarriedMotion) else []
-    dark = [Fault("camera-dark", *ride_s) for ride_s in rides_s]
-    plan, key = FaultPlan((*run.faults, *order.faults, *dark)), zlib.crc32(name.encode())
+    dark = [sensors.Fault("camera-dark", *ride_s) for ride_s in rides_s]
+    plan, key = sensors.FaultPlan((*run.faults, *order.faults, *dark)), zlib.crc32(name.encode())
     light, movers, has_blur = order.light, scenario.movers, not run.is_sharp
-    every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
+    every_time = [float(t) for t in sensors.sample_times(motion.duration_s, run.rate_hz)]
     times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
     end_s = times[-1] + 0.1 if times else motion.duration_s
     seeds = [order.seed + _SEEDS_PER_STOREY * storey for storey in run.storeys]
@@ -151,11 +140,13 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         for world in worlds
     ]
     renderer.above = list(zip([end_s for _, end_s in rides_s], above, strict=True))
-    wheel = measure_wheels(motion, kind.body_height_m, _generator(order, name, "wheels"))
-    priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
-    last_ns = int(stamps_from_s(np.array([end_s]))[0])
+    wheel = sensors.measure_wheels(motion, kind.body_height_m, _generator(order, name, "wheels"))
+    priors = sensors.measure_priors(
+        motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors")
+    )
+    last_ns = int(sensors.stamps_from_s(np.array([end_s]))[0])
     # Exact poses at every frame and each 20 ms
-    grid_s = sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)
+    grid_s = sensors.sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)
     truth_s = np.unique(np.rint(np.concatenate([grid_s, times]) * 1e9)) * 1e-9
     return Session(
         order=order,
@@ -165,10 +156,10 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         renderer=renderer,
         motion=motion,
         frame_times_s=tuple(times),
-        imu=plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu"))).between(0, last_ns),
+        imu=plan.spoil_imu(sensors.measure_imu(motion, kind.imu, _generator(order, name, "imu"))).between(0, last_ns),
         wheel=tuple(sample for sample in plan.spoil_wheels(wheel) if sample.stamp_ns < last_ns),
         priors=tuple(prior for prior in priors if prior.stamp_ns < last_ns),
-        truth=Trajectory(stamps_from_s(truth_s), motion.map_from_body(truth_s)),
+        truth=Trajectory(sensors.stamps_from_s(truth_s), motion.map_from_body(truth_s)),
     )
 
 

@@ -6,22 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap import core
+from fleetmap import core, version_grid
 from fleetmap.geometry import Array, Indices
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.version_grid import (
-    CELL_M,
-    FLOOR_M,
-    HEIGHT_STEP_M,
-    LOWEST_M,
-    SLICE_M,
-    SLICES,
-    TILE_CELLS,
-    Counts,
-    OccupancyGrid,
-    Tiles,
-    whole_grid,
-)
+from fleetmap.version_grid import CELL_M, FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, TILE_CELLS, Counts, Tiles
 from mapserver.plugins.dense_maps.dense_stereo import BLOCK_PX
 
 _RANGE_CELLS = 160  # of a view
@@ -141,11 +129,13 @@ def _height(old: Counts, new: Counts) -> Counts:
     return np.where((new == 0) | is_same, old, new)
 
 
-def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, OccupancyGrid]:
+def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, version_grid.OccupancyGrid]:
     """Return (2, H, W) metres over the ground of the lowest and the highest surface, NaN if unseen, and their grid."""
     layers = []
     for layer in (2, 3):
-        codes = whole_grid({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)
+        codes = version_grid.whole_grid(
+            {place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False
+        )
         known = codes.cells.view(np.uint8).astype(np.float64)
         layers.append(np.where(known > 0, LOWEST_M + (known - 0.5) * HEIGHT_STEP_M, np.nan))
     return np.stack(layers), codes

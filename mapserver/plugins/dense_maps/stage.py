@@ -11,14 +11,8 @@ from fleetmap.geometry import AnyArray, Mask
 from fleetmap.version_grid import CELL_M, TILE_CELLS, TILE_SIZE_M, Tiles, encode_grid, grid_report, known_grid
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.extras import ChosenDraft, Extra
-from mapserver.plugins.dense_maps.surfel_map import (
-    SurfelReport,
-    Surfels,
-    SurfelTile,
-    SurfelTiles,
-    encode_tile,
-    known_surfels,
-)
+from mapserver.plugins.dense_maps import surfel_map
+from mapserver.plugins.dense_maps.surfel_map import SurfelReport, Surfels, SurfelTile, SurfelTiles, encode_tile
 from mapserver.plugins.dense_maps.survey_grid import GridGrower, Grower, grow
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
@@ -35,7 +29,7 @@ def make_dense_maps(draft: ChosenDraft) -> dict[str, Extra]:
     grid_grower = GridGrower(grid_before(draft.corrections, old_grid))
     growers: dict[str, Grower] = {"grid": grid_grower} if settings.occupancy_grid else {}
     if settings.surfel_map:
-        known = SurfelTiles() if parent is None else known_surfels(parent, maps.blob)
+        known = SurfelTiles() if parent is None else surfel_map.known_surfels(parent, maps.blob)
         growers["surfels"] = surfel_grower = SurfelGrower(surfels_without(known, draft.corrections.is_due))
     without = grow(growers, draft.sessions, settings.stereo)
     grid = encode_grid(corrected_grid(draft.corrections, grid_grower.tiles, old_grid))

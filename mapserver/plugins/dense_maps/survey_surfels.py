@@ -16,20 +16,11 @@ from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
 from mapserver.drafting.draft_evidence import MappedSession
+from mapserver.plugins.dense_maps import surfel_map
 from mapserver.plugins.dense_maps.dense_stereo import STEP_PX
 from mapserver.plugins.dense_maps.exposure import Exposure, Sample, estimate_exposure, squared_tangent
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT, OCCUPIED
-from mapserver.plugins.dense_maps.surfel_map import (
-    EDGE_M,
-    EXPOSURE,
-    LEVELS,
-    MAX_RANGE_M,
-    NO_FALLOFF,
-    TILE_SIZE_M,
-    Surfels,
-    SurfelTiles,
-    encode_tile,
-)
+from mapserver.plugins.dense_maps.surfel_map import EDGE_M, LEVELS, MAX_RANGE_M, TILE_SIZE_M, Surfels, SurfelTiles
 from mapserver.plugins.dense_maps.survey_grid import DepthView
 from mapserver.survey.state import ImageStore
 
@@ -107,7 +98,7 @@ class SurfelGrower:
             found = Surfels.joined([left[~_known_finer(left, new, finer_by=0)], new[inside.all(axis=1)]])
             tiles.pop(place, None)
             if len(found):
-                tiles[place] = encode_tile(place, found)
+                tiles[place] = surfel_map.encode_tile(place, found)
             self._images.release()
         self.surfels = SurfelTiles(tiles, *self._light(before, exposure, shift))
 
@@ -158,7 +149,9 @@ class SurfelGrower:
         old = self.surfels.surfels(place)
         order, blocks = _blocks(old.points_map)
         old = old[order]
-        sums = self._weighed(old, blocks, images, Exposure(np.zeros(len(self._looks)), np.zeros(len(NO_FALLOFF))))
+        sums = self._weighed(
+            old, blocks, images, Exposure(np.zeros(len(self._looks)), np.zeros(len(surfel_map.NO_FALLOFF)))
+        )
         old = old[HIT * sums[:, 0] - sums[:, 1] > -AGAINST]
         kept: list[Any] = self._images.keep([old.points_map, old.normals, old.levels, old.greys])
         self._images.release()
@@ -196,7 +189,7 @@ class SurfelGrower:
             [*look.map_from_cam[:3, 3], *look.cam_from_map[2, :3], log - shift]
             for look, log in zip(self._looks, exposure.logs, strict=True)
         ]
-        new, old = np.array(lights).reshape(-1, EXPOSURE), before.exposures
+        new, old = np.array(lights).reshape(-1, surfel_map.EXPOSURE), before.exposures
         if len(new) and len(old):
             old = old[scipy.spatial.cKDTree(new[:, :3]).query(old[:, :3])[0] > _OWN_LIGHT_M]
         return tuple(exposure.falloff.round(6).tolist()), np.concatenate([new, old])

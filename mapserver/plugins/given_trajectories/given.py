@@ -11,18 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleetmap import geometry
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.geometry import (
-    Array,
-    Indices,
-    Mask,
-    quat_wxyz_from_rotation,
-    rotation_from_quat_wxyz,
-    se3,
-    se3_exp,
-    se3_inverse,
-    se3_log,
-)
+from fleetmap.geometry import Array, Indices, Mask, rotation_from_quat_wxyz, se3, se3_exp, se3_inverse, se3_log
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings import Recording
 from fleetmap.recordings.ordering import nearest
@@ -224,7 +215,7 @@ def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
     """Convert poses read as map_from_pose with quaternions x y z w to another convention."""
     matrices = trajectory.frame_from_body
     if reading.is_w_first:
-        xyzw = [quat_wxyz_from_rotation(each[:3, :3])[[1, 2, 3, 0]] for each in matrices]
+        xyzw = [geometry.quat_wxyz_from_rotation(each[:3, :3])[[1, 2, 3, 0]] for each in matrices]
         matrices = np.array(
             [se3(rotation_from_quat_wxyz(q), each[:3, 3]) for q, each in zip(xyzw, matrices, strict=True)]
         )

@@ -8,15 +8,8 @@ import typer
 
 from fleetmap.cli_options import TopicNames
 from fleetmap.errors import RecordingError, UsageError
-from mapserver.commands.options import (
-    Calibration,
-    SiteOptions,
-    check_output,
-    open_store,
-    topics_of,
-    version_named,
-    write_output,
-)
+from mapserver.commands import options as common
+from mapserver.commands.options import Calibration, SiteOptions, open_store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,25 +43,27 @@ def markers(
     from mapserver.store.archive import decode_archive
 
     for name, file in (("--out", options.out), ("--scaled", options.scaled)):
-        check_output(name, file)
+        common.check_output(name, file)
     if options.scaled is not None and options.known is None:
         raise UsageError("--scaled needs --known: the list of markers with known distances")
     known = None if options.known is None else read_markers(options.known)
     with open_store(options.store, read_only=True) as maps:
-        version = version_named(maps, options.site, options.version)
+        version = common.version_named(maps, options.site, options.version)
         archive = maps.archive(options.site, version)
     if archive is None:
         raise RecordingError(f"version {version} of {options.site} has no archive; build it again from its recording")
-    with open_recording(recording, OpenOptions(options.calibration, topics_of(context, options.topic))) as opened:
+    with open_recording(
+        recording, OpenOptions(options.calibration, common.topics_of(context, options.topic))
+    ) as opened:
         rig, survey = opened.calibration, decode_archive(archive)
         found = measure_markers(opened, survey.trajectory, options.size, options.dictionary)
     for marker in found.markers:
         x_m, y_m, z_m = marker.map_from_marker.position_m
         typer.echo(f"marker {marker.id}: {x_m:.3f} {y_m:.3f} {z_m:.3f} m, sigma {1e3 * marker.sigma_m:.0f} mm")
     if options.out is not None:
-        write_output(options.out, to_json(found, indent=2) + b"\n")
+        common.write_output(options.out, to_json(found, indent=2) + b"\n")
     if known is not None:
         scale = scale_by(found, known)
         typer.echo(f"scale: a metre of the map is {scale:.5f} m")
         if options.scaled is not None:
-            write_output(options.scaled, format_calibration(scaled(rig, scale)).encode())
+            common.write_output(options.scaled, format_calibration(scaled(rig, scale)).encode())

@@ -102,12 +102,7 @@ def _write(out: Path, text: str, advice: str) -> None:
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
     from mapserver.config import survey_settings
-    from mapserver.plugins.rig_measurement.from_guess import (
-        calibration_from_guess,
-        first_rig,
-        guessed_file,
-        guessed_in_words,
-    )
+    from mapserver.plugins.rig_measurement import from_guess
 
     known = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4}):(\d*\.?\d+)", guess)
     baseline_m = float(known[3]) if known else 0.0
@@ -118,16 +113,18 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         )
     with TemporaryDirectory() as folder, _shown() as tools:
         first = Path(folder) / "guess.yaml"
-        first.write_text(format_calibration(first_rig(int(known[1]), int(known[2]), baseline_m)), encoding="utf-8")
+        first.write_text(
+            format_calibration(from_guess.first_rig(int(known[1]), int(known[2]), baseline_m)), encoding="utf-8"
+        )
         with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
-            found = calibration_from_guess(
+            found = from_guess.calibration_from_guess(
                 _sound(recording.view(0)), survey_settings(config, recording.sensor_set), tools
             )
             name = recording.name
-    typer.echo("\n".join(guessed_in_words(found)))
+    typer.echo("\n".join(from_guess.guessed_in_words(found)))
     if out is not None:
         advice = f"add the pose of the IMU, then calibrate again with --calibration {out}"
-        _write(out, guessed_file(found, name), advice)
+        _write(out, from_guess.guessed_file(found, name), advice)
 
 
 def _in_words(parameter: "ParameterEstimate") -> tuple[str, str]:

@@ -19,15 +19,9 @@ from fleetmap.geometry import Array, Indices, Mask
 from fleetmap.relocalization.map_view import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.merge import session_alignment
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
-from mapserver.survey.merge.session_alignment import (
-    Alignment,
-    Images,
-    alignments,
-    count_places,
-    find_fixes,
-    follow_fixes,
-)
+from mapserver.survey.merge.session_alignment import Alignment, Images
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
@@ -161,9 +155,11 @@ class MembershipTest:
         if by_priors is not None:  # plus as many that priors put near a place of the map
             beside = np.flatnonzero(self._beside_the_map(by_priors).any(axis=1)).tolist()
             ks = sorted({*ks, *_spread(beside, settings.fix_keyframes)})
-        fixes = find_fixes(self._relocalizer, session.images, ks, session.body_from_cams, by_priors)
+        fixes = session_alignment.find_fixes(self._relocalizer, session.images, ks, session.body_from_cams, by_priors)
         self.tried = len(ks)
-        found = alignments(fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain))
+        found = session_alignment.alignments(
+            fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain)
+        )
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
         if not enough:
             most = found[0] if found else Alignment((), np.eye(4), 0)
@@ -175,7 +171,7 @@ class MembershipTest:
         # At the priors' pose there may be few fixes: most of it is new, and a similar place in the map may have more.
         places = []
         for placed in sorted(enough, key=self._is_elsewhere_by_priors)[:_MOST_PLACES]:
-            map_from_body, believed = follow_fixes(placed, session.survey_from_body, session.chain)
+            map_from_body, believed = session_alignment.follow_fixes(placed, session.survey_from_body, session.chain)
             apart_m = self._priors_off_m(placed, map_from_body)
             priors_off_m = None if apart_m is None else round(apart_m, 2)
             seen = self.confirmation(map_from_body)
@@ -199,7 +195,7 @@ class MembershipTest:
         linked = np.isin(pieces, pieces[sorted(own)])
         for other in found:
             ks = sorted({fix.k for fix in other.fixes} - own)
-            places = count_places(session.survey_from_body[ks, :3, 3])
+            places = session_alignment.count_places(session.survey_from_body[ks, :3, 3])
             if len(ks) < self._settings.min_fixes or places < self._settings.min_places:
                 continue
             there = other.map_from_survey @ session.survey_from_body[ks]

@@ -13,19 +13,14 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
 from mapserver.survey.loops.connected_components import find_groups
+from mapserver.survey.merge import membership
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import SurveyLimits, what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import Sightings, keyframe_features, match_keyframe, session_relocalization
 from mapserver.survey.merge.joint_adjustment import JointSolution, Measured, adjust_jointly, begun, grown
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
-from mapserver.survey.merge.membership import (
-    Membership,
-    MembershipEvidence,
-    MembershipTest,
-    MembershipVerdict,
-    SessionKeyframes,
-)
+from mapserver.survey.merge.membership import Membership, MembershipEvidence, MembershipVerdict, SessionKeyframes
 from mapserver.survey.merge.merge import merged
 from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from mapserver.survey.settings import SurveySettings
@@ -213,7 +208,7 @@ def extend(
     base = BaseMap(base_map, state.rig.camera, state.rig.body_from_cam[0])
     relocalizer = Relocalizer(base.view(survey.vocabulary), base.camera, session_relocalization(settings))
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
-    test = MembershipTest(relocalizer, firm, _keyframes_of(session), settings.sessions)
+    test = membership.MembershipTest(relocalizer, firm, _keyframes_of(session), settings.sessions)
     located = test.locate()
     if isinstance(located, Membership):
         return located

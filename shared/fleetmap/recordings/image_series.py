@@ -11,22 +11,16 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Indices, Mask
+from fleetmap.recordings import ordering
 from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
-from fleetmap.recordings.ordering import (
-    DEPTH_TOLERANCE_NS,
-    PAIR_TOLERANCE_NS,
-    ReadLog,
-    forward_only,
-    nearest,
-    pair_stamps,
-)
+from fleetmap.recordings.ordering import ReadLog, forward_only, nearest, pair_stamps
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 SILENT_NS = 500_000_000  # a camera without images for longer is silent
 _DAY_NS = 86_400_000_000_000
-_TOLERANCES_NS = {"right": PAIR_TOLERANCE_NS, "depth": DEPTH_TOLERANCE_NS}
+_TOLERANCES_NS = {"right": ordering.PAIR_TOLERANCE_NS, "depth": ordering.DEPTH_TOLERANCE_NS}
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,9 @@ from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import Indices
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import StoredFrame, file_kind
+from fleetmap.sensors import samples
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import (
-    CameraFrame,
-    DataIssue,
-    ImuSamples,
-    PositionPrior,
-    SensorSet,
-    Stamps,
-    Trajectory,
-    WheelSample,
-)
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory
 from fleetmap.sensors.source_settings import Topics
 
 
@@ -118,7 +110,7 @@ class Recording:
     frame_stamps_ns: Stamps
     imu: ImuSamples
     frames: FrameSource
-    wheel: tuple[WheelSample, ...] = ()
+    wheel: tuple[samples.WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
     issues: tuple[DataIssue, ...] = ()

@@ -6,14 +6,7 @@ Slow to import (150 ms): import it only to fetch a list.
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tuf.api.exceptions import (
-    BadVersionNumberError,
-    DownloadError,
-    DownloadHTTPError,
-    DownloadLengthMismatchError,
-    ExpiredMetadataError,
-    RepositoryError,
-)
+from tuf.api import exceptions
 from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
 from fleetmap.errors import FleetmapError, UnreachableError, UntrustedError
@@ -45,9 +38,9 @@ class ListFetcher(FetcherInterface):
             data = self._ask(name)
         except FleetmapError as error:
             self.fault = error
-            raise DownloadError(str(error)) from error
+            raise exceptions.DownloadError(str(error)) from error
         if data is None:
-            raise DownloadHTTPError(f"the server has no {name}", 404)
+            raise exceptions.DownloadHTTPError(f"the server has no {name}", 404)
         return iter([data])
 
 
@@ -64,13 +57,13 @@ def update_lists(folder: Path, site: str, root: bytes, ask: Callable[[str], byte
         updater.refresh()
         # python-tuf loads a role only with one of its targets; version 0 never exists.
         updater.get_targetinfo(manifest_target(site, 0))
-    except (ExpiredMetadataError, DownloadHTTPError) as error:
+    except (exceptions.ExpiredMetadataError, exceptions.DownloadHTTPError) as error:
         raise UntrustedError("freeze", error) from error
-    except DownloadLengthMismatchError as error:
+    except exceptions.DownloadLengthMismatchError as error:
         raise UntrustedError("size", error) from error
-    except DownloadError as error:
+    except exceptions.DownloadError as error:
         raise fetcher.fault or UnreachableError(str(error)) from error
-    except BadVersionNumberError as error:
+    except exceptions.BadVersionNumberError as error:
         raise UntrustedError("rollback", error) from error
-    except (RepositoryError, ValueError) as error:
+    except (exceptions.RepositoryError, ValueError) as error:
         raise UntrustedError("signature", error) from error

@@ -9,15 +9,8 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_log
 from fleetmap.plugins.other_recorders.decoders import CameraInfo
 from fleetmap.recordings.ros2.messages import FrameLink
-from fleetmap.sensors.calibration import (
-    LEAST_BASELINE_M,
-    SAME_WAY_COSINE,
-    CameraCalibration,
-    ImuNoise,
-    RigCalibration,
-    check_camera,
-    intrinsics_of,
-)
+from fleetmap.sensors import calibration
+from fleetmap.sensors.calibration import LEAST_BASELINE_M, CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
 _UPRIGHT = 0.9  # the cosine of 26 degrees
@@ -139,7 +132,7 @@ def frames_not_optical(cameras: Sequence[CameraInfo], links: Sequence[FrameLink]
 
 def _camera(info: CameraInfo, body_from_cam: Array, where: str) -> CameraCalibration:
     model, distortion = lens_of(info.lens, info.distortion, f"{where}: CameraInfo of {info.frame_id}")
-    lens = model, info.width_px, info.height_px, intrinsics_of(info.matrix), distortion
+    lens = model, info.width_px, info.height_px, calibration.intrinsics_of(info.matrix), distortion
     return check_camera(CameraCalibration(*lens, body_from_cam), f"{where}: {info.frame_id}")
 
 
@@ -156,7 +149,7 @@ def _left_from_right(cameras: Sequence[CameraInfo], links: Sequence[FrameLink], 
     fx = right.projection[0, 0]
     baseline_m = -right.projection[0, 3] / fx if fx else 0.0
     if baseline_m <= LEAST_BASELINE_M:
-        if cam0_from_cam1 is not None and cam0_from_cam1[2, 2] < SAME_WAY_COSINE:
+        if cam0_from_cam1 is not None and cam0_from_cam1[2, 2] < calibration.SAME_WAY_COSINE:
             return cam0_from_cam1
         issues = "".join(f", {link.issue}" for link in links if link.issue)
         raise CalibrationError(

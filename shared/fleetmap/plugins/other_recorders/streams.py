@@ -26,19 +26,8 @@ from fleetmap.plugins.other_recorders.calibration import (
 )
 from fleetmap.plugins.other_recorders.decoders import ENCODINGS, IMU_TYPES, CameraInfo
 from fleetmap.recordings.calibration_files import CalibrationFile
-from fleetmap.recordings.mcap.streams import (
-    UNDECODABLE,
-    Channel,
-    Container,
-    ImageStream,
-    Place,
-    Roles,
-    Stream,
-    assemble,
-    attached_calibration,
-    collect,
-    opened,
-)
+from fleetmap.recordings.mcap import streams as mcap_streams
+from fleetmap.recordings.mcap.streams import Channel, Container, ImageStream, Place, Roles, Stream
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -191,7 +180,7 @@ class _InfoStream(Stream):
         try:
             info: CameraInfo = self.container.decode(self.channel, data)
             lens = info if info.matrix[0, 0] > 0 else None
-        except UNDECODABLE:
+        except mcap_streams.UNDECODABLE:
             lens = None
         if self.lens is None:
             self.messages, self.log_times_ns = [], []
@@ -213,8 +202,8 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
 
     opener: must be picklable, because other processes may read part of the frames.
     """
-    with opened(opener, options) as (container, given, log):
-        streams, others = collect(container, partial(_stream_of, container, options.topics), log)
+    with mcap_streams.opened(opener, options) as (container, given, log):
+        streams, others = mcap_streams.collect(container, partial(_stream_of, container, options.topics), log)
         note_videos(others, log)
         used = [stream for stream in streams if stream.messages or isinstance(stream, ImageStream)]
         if not used:
@@ -224,7 +213,7 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
             raise RecordingError(f"{container.path} holds no message that can be read ({why})")
         topics = _with_hints(options.topics, given, {stream.channel.topic for stream in used})
         roles = _choose_topics(used, topics, str(container.path), log)
-        calibration = given.calibration if given else attached_calibration(container)
+        calibration = given.calibration if given else mcap_streams.attached_calibration(container)
         lenses = _lenses_of(roles, log) if calibration is None else {}
 
         def calibrate(imu_frame: str | None) -> tuple[RigCalibration, Sequence[str]]:
@@ -237,7 +226,7 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
             return found, described
 
         usable = {role: lens.usable for role, lens in lenses.items()}
-        return assemble(path, file_format, container, opener, streams, roles, calibrate, log, usable)
+        return mcap_streams.assemble(path, file_format, container, opener, streams, roles, calibrate, log, usable)
 
 
 def _stream_of(container: Container, topics: Topics, channel: Channel) -> Stream | None:

@@ -14,20 +14,12 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, Mask
-from fleetmap.recordings import limits
+from fleetmap.recordings import limits, ordering
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize, logged_calibration
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
-from fleetmap.recordings.ordering import (
-    LAST_NS,
-    ReadLog,
-    as_logged,
-    clean_imu,
-    forward_only,
-    trajectory_of_rows,
-    usual_size,
-)
+from fleetmap.recordings.ordering import LAST_NS, ReadLog, as_logged, clean_imu, forward_only, usual_size
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.ros2 import messages as ros
 from fleetmap.recordings.ros2.cdr import unpack
@@ -367,7 +359,7 @@ def _ground_truth(streams: Sequence[Stream], log: ReadLog) -> Trajectory | None:
         return None
     rows = np.stack([row for _, (_, row) in values])
     stamps_ns, order = as_logged([ns for _, (ns, _) in values], [at for at, _ in values], "ground truth", log)
-    return trajectory_of_rows(stamps_ns[order], rows[order], log)
+    return ordering.trajectory_of_rows(stamps_ns[order], rows[order], log)
 
 
 class MessageReader(ImageReader):
