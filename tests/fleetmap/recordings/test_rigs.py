@@ -55,10 +55,9 @@ def test_views_look_where_the_robot_turns_them() -> None:
     rear = simulated("front-rear")[0].cameras
     turned = se3_inverse(rear[0].body_from_cam) @ rear[2].body_from_cam
     assert turned[2, 2] == pytest.approx(-1.0, abs=0.01)
-    rectifier = Rectifier(simulated("front-rear")[0])
-    assert [mounted.camera.baseline_m for mounted in rectifier.mounted] == pytest.approx([0.12, 0.12])
-    sides = Rectifier(simulated("front-sides")[0]).mounted
-    assert [mounted.camera.baseline_m for mounted in sides] == pytest.approx([0.12, 0.0, 0.0])
+    for rig, baselines_m in (("front-rear", [0.12, 0.12]), ("front-sides", [0.12, 0.0, 0.0])):
+        mounted = Rectifier(simulated(rig)[0]).mounted
+        assert [camera.baseline_m for camera, _ in mounted] == pytest.approx(baselines_m)
 
 
 def test_a_view_without_images_at_a_moment_is_none_there(tmp_path: Path) -> None:
@@ -71,10 +70,9 @@ def test_a_view_without_images_at_a_moment_is_none_there(tmp_path: Path) -> None
 def test_cameras_with_stamps_of_their_own_are_the_nearest_of_each_frame(tmp_path: Path) -> None:
     """The rear pair is 20 ms late; the rectified frame has the first view's clock."""
     calibration, frames = simulated("front-rear")
-    later = [
-        replace(f, others=tuple(replace(o, stamp_ns=o.stamp_ns + 20_000_000) for o in f.others if o)) for f in frames
-    ]
-    with written(tmp_path / "a.mcap", "front-rear", tuple(later)) as recording:
+    rear = [tuple(replace(o, stamp_ns=o.stamp_ns + 20_000_000) for o in frame.others if o) for frame in frames]
+    later = tuple(replace(frame, others=others) for frame, others in zip(frames, rear, strict=True))
+    with written(tmp_path / "a.mcap", "front-rear", later) as recording:
         frame = recording.read_frame(2)
         assert frame.others[0] is not None and frame.others[0].stamp_ns == frame.stamp_ns + 20_000_000
         offset = [replace(c, imu_minus_cam_s=-0.02 if n > 1 else 0.0) for n, c in enumerate(calibration.cameras)]
@@ -125,9 +123,8 @@ def test_eurocs_folder_with_four_cameras(tmp_path: Path) -> None:
     turned = se3(np.diag([-1.0, -1.0, 1.0]), np.array([-0.3, 0.0, 0.0]))  # body_from_turned
     for number in (0, 1):
         shutil.copytree(folder / f"mav0/cam{number}", folder / f"mav0/cam{number + 2}")
-    rig = replace(
-        kept, cameras=(*kept.cameras, *(replace(c, body_from_cam=turned @ c.body_from_cam) for c in kept.cameras))
-    )
+    rear = tuple(replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in kept.cameras)
+    rig = replace(kept, cameras=kept.cameras + rear)
     file = tmp_path / "camchain.yaml"
     file.write_text(format_calibration(rig))
     assert read_calibration(file).views == ((0, 1), (2, 3))
@@ -147,19 +144,15 @@ def test_a_damaged_or_wrong_image_of_another_view_leaves_the_first_one_usable(tm
     calibration, frames = simulated("front-rear")
     stored = store_frame(frames[1])
     (rear,) = stored.others
-    assert rear is not None
     damaged = replace(stored, others=(replace(rear, left=StoredImage("file", b"\xff\xd8 no more")),))
     assert decode_frame(damaged).others == (None,)
     large = np.zeros((100, 100), np.uint8)
     other = replace(frames[1], others=(CameraFrame(frames[1].stamp_ns, large, large),))
     rectified = Rectifier(calibration).rectify(other)
     assert rectified.view(1) is None and rectified.left.any()
+    wrong = tuple(replace(f, others=(CameraFrame(f.stamp_ns, large, large),)) for f in frames)
     with pytest.raises(RecordingError, match=r"cam2 image at .* is 100x100 px, the calibration says 96x72"):
-        written(
-            tmp_path / "a.mcap",
-            "front-rear",
-            tuple(replace(f, others=(CameraFrame(f.stamp_ns, large, large),)) for f in frames),
-        )
+        written(tmp_path / "a.mcap", "front-rear", wrong)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +190,6 @@ def test_a_rig_is_described_by_camera_info_and_transforms(
         assert recording.calibration.views == (((0, 1), (2, 3)) if cameras == 4 else ((0, 1), (2,)))
         (other,) = recording.read_frame(1).others
         (recorded,) = frames[1].others
-        assert other is not None and recorded is not None and recorded.right is not None
         assert np.array_equal(other.left, recorded.right if lacks[:1] == ("cam2",) else recorded.left)
         assert any(issue in each.detail for each in recording.issues) if issue else not recording.issues
 
@@ -266,7 +258,6 @@ def test_a_robot_and_its_recordings_pair_by_mounting(tmp_path: Path) -> None:
     for frame in map(store_frame, frames):
         (rear,) = frame.others
         for number, image in ((1, rear.left), (3, rear.right), (0, frame.left), (2, frame.right)):
-            assert image is not None
             complete += live.add(number, frame.stamp_ns, image)
     with open_recording(write_rig(tmp_path / "a.mcap", calibration, map(decode_frame, complete))) as recording:
         assert recording.calibration.views == ((0, 1), (2, 3)) and len(recording) == 4

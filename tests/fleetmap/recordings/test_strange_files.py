@@ -57,13 +57,9 @@ def test_damaged_files_of_every_format(name: str, tmp_path: Path, capsys: pytest
     options, calibration = OpenOptions(rig), [] if rig is None else ["--calibration", str(rig)]
     path = WRITERS[name](tmp_path / "recording")
     files = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
+    made = [file for file in reversed(files) if "source" not in file.parts]
     # The first of many images, and of one camera
-    kinds = {
-        re.sub(r"\d+", "", str(file.relative_to(tmp_path))): file
-        for file in reversed(files)
-        if "source" not in file.parts
-    }
-    for file in kinds.values():
+    for file in {re.sub(r"\d+", "", str(file.relative_to(tmp_path))): file for file in made}.values():
         sound = file.read_bytes()
         for damage, spoil in (DAMAGES | (OF_CONTAINERS if file.suffix in CONTAINERS else {})).items():
             file.write_bytes(spoil(sound))
@@ -107,9 +103,8 @@ def test_tables_of_euroc_as_other_programs_write_them(tmp_path: Path, joint: str
     rewritten(images, lambda rows: [["stamp", "file", "exposure"], *([*row, "0.01"] for row in rows[1:])], joint)
     accel, gyro = "a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z", "w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z"
     header = f"timestamp,{accel},{gyro},temperature".split(",")
-    rewritten(
-        imu, lambda rows: [header, *([row[0], *row[4:7], *row[1:4], "21"] for row in rows if row[0].isdecimal())], joint
-    )
+    swapped = lambda rows: [[row[0], *row[4:7], *row[1:4], "21"] for row in rows if row[0].isdecimal()]  # noqa: E731
+    rewritten(imu, lambda rows: [header, *swapped(rows)], joint)
     with open_recording(folder) as found, open_recording(wanted) as right:
         assert found.issues == ()
         assert found.frame_stamps_ns.tolist() == right.frame_stamps_ns.tolist()
@@ -126,9 +121,8 @@ def test_bits_of_grey_images_of_16(tmp_path: Path, bits: int) -> None:
             grey = ros_messages.decode_image(data, "").data
             wide = np.frombuffer(grey, np.uint8).astype("<u2") << (bits - 8)
             image = ros_messages.StoredImage("mono16", wide.tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH)
-            messages.append((topic, kind, stamp_ns, ros_messages.encode_image(stamp_ns, "cam0_optical", image)))
-        else:
-            messages.append((topic, kind, stamp_ns, data))
+            data = ros_messages.encode_image(stamp_ns, "cam0_optical", image)  # noqa: PLW2901
+        messages.append((topic, kind, stamp_ns, data))
     for path in (write_foreign(tmp_path / "a.mcap", messages), write_rosbag1(tmp_path / "a.bag", messages)):
         with open_recording(path) as recording:
             np.testing.assert_array_equal(recording.read_frame(1).left, SAMPLE.left[1])

@@ -70,18 +70,14 @@ def moved(numbers: str) -> Spoil:
     return edit(TRUTH, lambda rows: [*rows[:2], f"{rows[2].partition(',')[0]},{numbers}", *rows[3:]])
 
 
-def larger_lens(folder: Path) -> None:
-    edit("mav0/cam0/sensor.yaml", lambda rows: [row.replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]") for row in rows])(
-        folder
-    )
-
-
 def nothing_left(folder: Path) -> None:
     for number in range(4):
         image(folder, 1, number).write_bytes(b"")
 
 
 CAMERA, TABLE, TRUTH = "mav0/cam0/data.csv", "mav0/imu0/data.csv", "mav0/state_groundtruth_estimate0/data.csv"
+SENSOR = "mav0/cam0/sensor.yaml"
+LARGER_LENS = edit(SENSOR, lambda rows: [row.replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]") for row in rows])
 
 
 def test_paths_that_are_no_recording(tmp_path: Path) -> None:
@@ -104,7 +100,7 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
         (lambda folder: (folder / CAMERA).unlink(), r"data\.csv cannot be read"),
         (lambda folder: shutil.rmtree(folder / "mav0/cam0"), "cam0 is missing"),
         (nothing_left, r"cam1: none of the 4 images .*4 without a byte"),
-        (larger_lens, "752x480.*--calibration"),
+        (LARGER_LENS, "752x480.*--calibration"),
         (lambda folder: (folder / "mav0/cam1/sensor.yaml").unlink(), r"cam1/sensor\.yaml is missing.*--calibration FILE"),
         (imu(accel=ACCEL / 9.80665), r"in g \(median 1\.00"),
         (imu(gyro=np.degrees(GYRO)), "degrees per second"),

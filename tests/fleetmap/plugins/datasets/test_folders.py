@@ -99,9 +99,8 @@ def test_euroc_imu_that_is_not_the_body(tmp_path: Path) -> None:
     recording = open_recording(folder)
     imu_from_cam = recording.calibration.cameras[0].body_from_cam
     np.testing.assert_allclose(imu_from_cam, se3_inverse(euroc_from_imu) @ BODY_FROM_CAM0, atol=1e-12)
-    np.testing.assert_allclose(
-        recording.ground_truth.frame_from_body[0], SAMPLE.world_from_body[0] @ euroc_from_imu, atol=1e-9
-    )
+    first = recording.ground_truth.frame_from_body[0]
+    np.testing.assert_allclose(first, SAMPLE.world_from_body[0] @ euroc_from_imu, atol=1e-9)
 
 
 def test_right_images_a_little_late_are_paired(tmp_path: Path) -> None:
@@ -215,8 +214,7 @@ def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Pat
     (tmp_path / "rig.yaml").write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(folder, OpenOptions(calibration_file=tmp_path / "rig.yaml"))
     depth = recording.read_frame(0).depth_m
-    near = np.flatnonzero(depth[HEIGHT // 2] == 2)
-    far = np.flatnonzero(depth[HEIGHT // 2] == 5)
+    near, far = (np.flatnonzero(depth[HEIGHT // 2] == metres) for metres in (2, 5))
     assert near[-1] == pytest.approx(WIDTH // 2 - 1 + 300 * 0.05 / 2, abs=1)
     assert far[0] == near[-1] + 1
     assert far[-1] == WIDTH - 1

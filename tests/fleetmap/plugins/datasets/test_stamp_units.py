@@ -29,13 +29,11 @@ def messages(topic: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> list
     monkeypatch.setattr(mcap_samples, "SAMPLE", SAMPLE)
     imu = ImuSamples(SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2)
     monkeypatch.setattr(mcap_samples, "IMU", imu)
-    found = []
-    for name, kind, stamp_ns, data in mcap_samples.foreign_messages():
-        written = data
-        if topic in name:
-            written = data[:4] + struct.pack("<iI", *divmod(int(stamp_ns * factor), 10**9)) + data[12:]
-        found.append((name, kind, stamp_ns, written))
-    return found
+    stamp = lambda ns: struct.pack("<iI", *divmod(int(ns * factor), 10**9))  # noqa: E731
+    return [
+        (name, kind, ns, data[:4] + stamp(ns) + data[12:] if topic in name else data)
+        for name, kind, ns, data in mcap_samples.foreign_messages()
+    ]
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e-3, "microseconds"), (1e-6, "milliseconds"), (1e-9, "seconds")])
@@ -114,17 +112,14 @@ def test_work_is_bounded_whatever_stamps_say(tmp_path: Path) -> None:
 def test_a_live_source(factor: int, unit: str) -> None:
     now_ns = 1_700_000_000_123_456_789
     intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=0.1)
-    early, late = (
-        ImuSamples(np.array([ns // factor]), np.zeros((1, 3)), np.zeros((1, 3))) for ns in (now_ns, now_ns + 10**9)
-    )
+    zero = np.zeros((1, 3))
+    early, late = (ImuSamples(np.array([ns // factor]), zero, zero) for ns in (now_ns, now_ns + 10**9))
     intake.put_imu(early)
     intake.put_frame(CameraFrame(now_ns + 5, np.zeros((4, 4), np.uint8)))
-    for put, value in (
-        (intake.put_imu, late),
-        (intake.put_wheel, WheelSample(now_ns // factor, np.zeros(3), 0.0, 0.1, 0.1)),
-    ):
-        with pytest.raises(RecordingError, match=f"look like {unit}"):
-            put(value)  # type: ignore[operator]
+    with pytest.raises(RecordingError, match=f"look like {unit}"):
+        intake.put_imu(late)
+    with pytest.raises(RecordingError, match=f"look like {unit}"):
+        intake.put_wheel(WheelSample(now_ns // factor, np.zeros(3), 0.0, 0.1, 0.1))
     intake.finish()
     assert len(intake.take(1.0).imu) == 0
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
 from mapserver.cli import app
 from support.recordings.recording_samples import HEIGHT, kalibr_text, make_sample, write_tum_rgbd
+from support.room_site import invoke
 
 SAMPLE = make_sample(4)
 
@@ -55,9 +55,8 @@ def test_lists_that_do_not_pair(folder: Path) -> None:
     rows = [line.split() for line in (folder / "depth.txt").read_text().splitlines() if not line.startswith("#")]
     shifted = [f"{float(stamp) + 100:.6f} {name}" for stamp, name in rows]
     (folder / "depth.txt").write_text("\n".join(shifted))
-    with pytest.raises(
-        RecordingError, match=r"no image of rgb\.txt has one of depth\.txt within 0\.02 s.* 99\.\d+ s apart"
-    ):
+    says = r"no image of rgb\.txt has one of depth\.txt within 0\.02 s.* 99\.\d+ s apart"
+    with pytest.raises(RecordingError, match=says):
         open_recording(folder, options(folder))
     (folder / "depth.txt").write_text("\n".join([*(" ".join(row) for row in rows[:2]), *shifted[2:]]))
     with open_recording(folder, options(folder)) as recording:
@@ -104,7 +103,7 @@ def test_a_bad_row_of_the_truth_costs_itself(
         assert re.search(says, f"{issue.what} {issue.detail}")
     if left is not None:
         (folder / "estimate.tum").write_text("\n".join(rows))
-        done = CliRunner().invoke(app, ["evaluate", str(folder / "estimate.tum"), "--ground-truth", str(truth)])
+        done = invoke(app, "evaluate", folder / "estimate.tum", "--ground-truth", truth)
         assert (done.exit_code, bool(re.search(says, done.stderr))) == (0, True), done.stderr
 
 

@@ -51,9 +51,7 @@ def parts(folder: Path, storage: StoragePlugin) -> Path:
     ids=["neighbours", "backwards", "publishers", "both", "sqlite parts", "mcap parts", "ros1", "recorder's clock"],
 )
 def test_messages_count_as_they_were_logged(tmp_path: Path, write: Callable[[Path], Path]) -> None:
-    with (
-        open_recording(write(tmp_path)) as recording,
-        open_recording(write_foreign(tmp_path / "plain.mcap", MESSAGES)) as plain,
-    ):
+    sorted_file = write_foreign(tmp_path / "plain.mcap", MESSAGES)
+    with open_recording(write(tmp_path)) as recording, open_recording(sorted_file) as plain:
         assert recording.issues == plain.issues == ()
         assert_same(recording, plain)

@@ -12,7 +12,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import Recording, StoredFrame, open_recording
+from fleetmap.recordings import open_recording
 from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from fleetmap.sensors.source_settings import Topics
@@ -62,17 +62,7 @@ def live_depth(form: str, data: bytes) -> np.ndarray:
     ):
         (take,) = (take for names, _, take in sensors.topics if topic in names)
         take(queue, True, payload)
-    frame = queue.take(1.0).frame
-    assert isinstance(frame, StoredFrame)
-    depth_m = decode_frame(frame).depth_m
-    assert depth_m is not None
-    return depth_m
-
-
-def depth_of(recording: Recording) -> np.ndarray:
-    depth_m = recording.read_frame(1).depth_m
-    assert depth_m is not None
-    return depth_m
+    return decode_frame(queue.take(1.0).frame).depth_m
 
 
 @pytest.mark.parametrize(
@@ -88,17 +78,11 @@ def depth_of(recording: Recording) -> np.ndarray:
 )
 def test_compressed_depth_is_metres_in_bags_and_live(tmp_path: Path, form: str, data: bytes, step_m2: float) -> None:
     messages = with_images("/depth/image_raw/compressedDepth", form, data)
-    paths = [
-        write_foreign(tmp_path / "a.mcap", messages),
-        write_rosbag2(tmp_path / "rosbag2", messages),
-        write_rosbag1(tmp_path / "a.bag", messages),
-    ]
+    paths = [write_foreign(tmp_path / "a.mcap", messages), write_rosbag2(tmp_path / "rosbag2", messages)]
+    paths += [write_rosbag1(tmp_path / "a.bag", messages), tmp_path / "copy.mcap"]
     with open_recording(paths[0]) as recording:
-        copy_to_mcap(recording, tmp_path / "copy.mcap")
-    found = [live_depth(form, data)]
-    for path in (*paths, tmp_path / "copy.mcap"):
-        with open_recording(path) as recording:
-            found.append(depth_of(recording))
+        copy_to_mcap(recording, paths[-1])
+    found = [live_depth(form, data), *(open_recording(path).read_frame(1).depth_m for path in paths)]
     wanted = np.nan_to_num(DEPTH_M)
     for depth_m in found:
         np.testing.assert_array_equal(depth_m > 0, wanted > 0)
@@ -163,10 +147,8 @@ def test_packets_of_a_video_are_named(tmp_path: Path) -> None:
     """By Foxglove's own class, whose recordings hold one message a picture that cannot be read alone."""
     with (tmp_path / "a.mcap").open("wb") as file, ProtobufWriter(file) as writer:
         for stamp_ns in STAMPS_NS:
-            writer.write_message(
-                "/cam0/video", CompressedVideo(data=b"\0\0\0\1\x67", format="h264"), stamp_ns, stamp_ns
-            )
-    with pytest.raises(
-        RecordingError, match=r"video not read: /cam0/video \(foxglove.CompressedVideo\); record JPEG or raw"
-    ):
+            packet = CompressedVideo(data=b"\0\0\0\1\x67", format="h264")
+            writer.write_message("/cam0/video", packet, stamp_ns, stamp_ns)
+    says = r"video not read: /cam0/video \(foxglove.CompressedVideo\); record JPEG or raw"
+    with pytest.raises(RecordingError, match=says):
         open_recording(tmp_path / "a.mcap")

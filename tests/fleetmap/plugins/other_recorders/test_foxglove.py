@@ -65,11 +65,8 @@ def write(path: Path) -> Path:
             writer.write_message("/tf_static", link, 1, 1)
             fx, fy, cx, cy = camera.intrinsics_px
             lens = CameraCalibration(timestamp=stamp(1), frame_id=f"cam{number}", width=WIDTH, height=HEIGHT)
-            lens.distortion_model, lens.D[:], lens.K[:] = (
-                "plumb_bob",
-                [1e-9, 0, 0, 0, 0],
-                [fx, 0, cx, 0, fy, cy, 0, 0, 1],
-            )
+            lens.distortion_model, lens.D[:] = "plumb_bob", [1e-9, 0, 0, 0, 0]
+            lens.K[:] = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
             writer.write_message(f"/cam{number}/camera_info", lens, 1, 1)
         for i, s in enumerate(SAMPLE.stamps_ns.tolist()):
             left = RawImage(timestamp=stamp(s), frame_id="cam0", width=WIDTH, height=HEIGHT, encoding="mono8")

@@ -38,12 +38,8 @@ def test_files_of_this_project_are_the_same_for_both_readers(tmp_path: Path, rig
     calibration, frames = simulated(rig)
     path = write_rig(tmp_path / "a.mcap", calibration, frames)
     with reader.open_mcap(path, OpenOptions()) as plain, open_recording(path) as recording:
-        assert (plain.format, plain.name, plain.sensor_set, plain.issues) == (
-            recording.format,
-            recording.name,
-            recording.sensor_set,
-            recording.issues,
-        )
+        for name in ("format", "name", "sensor_set", "issues"):
+            assert getattr(plain, name) == getattr(recording, name)
         assert format_calibration(plain.calibration) == format_calibration(recording.calibration)
         assert plain.content_hash() == recording.content_hash()
         np.testing.assert_array_equal(plain.frame_stamps_ns, recording.frame_stamps_ns)
@@ -57,10 +53,7 @@ def test_files_of_this_project_are_the_same_for_both_readers(tmp_path: Path, rig
         ({}, {"compression": CompressionType.ZSTD}),
         ({}, {"compression": CompressionType.LZ4}),
         ({}, {"use_chunking": False}),
-        (
-            {},
-            {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
-        ),
+        ({}, dict.fromkeys(("use_summary_offsets", "use_statistics", "repeat_channels", "repeat_schemas"), False)),
         ({}, {"enable_crcs": False}),
         ({"left": "/camera/left/image_raw", "right": "/camera/right/image_raw", "imu": "/sensors/imu"}, {}),
     ],
@@ -172,10 +165,8 @@ def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
     depth_mm = np.full((HEIGHT, WIDTH), 2500, np.uint16)
     depth_mm[:5], depth_mm[5:9] = 0, 65535
     if encoding == "png":
-        name, data = "sensor_msgs/CompressedImage", cv2.imencode(".png", depth_mm)[1].tobytes()
-        message = ros_messages.encode_compressed_image(
-            LEFT[0][2], "c", StoredImage("file", data), "16UC1; png compressed"
-        )
+        name, image = "sensor_msgs/CompressedImage", StoredImage("file", cv2.imencode(".png", depth_mm)[1].tobytes())
+        message = ros_messages.encode_compressed_image(LEFT[0][2], "c", image, "16UC1; png compressed")
     else:
         pixels = depth_mm if encoding == "16UC1" else np.where(depth_mm == 2500, np.float32(2.5), np.float32(np.nan))
         rows = StoredImage(encoding, pixels.tobytes(), "", WIDTH, HEIGHT, pixels.strides[0])

@@ -15,20 +15,15 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, Recording, named_topics, open_recording
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.ros2 import messages as ros_messages
+from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import WheelSample
 from support.recordings.bag_samples import edited, write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import FRAME_NS, HEIGHT, WIDTH, calibration
 
 STAMPS_NS = SAMPLE.stamps_ns.tolist()
-LEFT, RIGHT, INFO, GYRO, WHEEL, TF = (
-    "/cam0/image_raw",
-    "/cam1/image_raw",
-    "/cam0/camera_info",
-    "/imu0",
-    "/odom",
-    "/tf_static",
-)
+LEFT, RIGHT, INFO = "/cam0/image_raw", "/cam1/image_raw", "/cam0/camera_info"
+GYRO, WHEEL, TF = "/imu0", "/odom", "/tf_static"
 WHEELS = [WheelSample(s + 1000, np.array([0.5, 0.0, 0.0]), 0.1, 0.1, 0.1) for s in STAMPS_NS]
 # Stereo, IMU, transforms and wheels, in the order of writing.
 DRIVE: list[Message] = foreign_messages() + [
@@ -46,8 +41,9 @@ def without(topic: str) -> list[Message]:
     return [message for message in DRIVE if message[0] != topic]
 
 
-def renamed(topic: str, name: str) -> list[Message]:
-    return [(name, *message[1:]) for message in of(topic)]
+def twice(topic: str, *names: str) -> list[Message]:
+    """A topic's messages under two other names."""
+    return without(topic) + [(name, *message[1:]) for name in names for message in of(topic)]
 
 
 def cut(topic: str, row: int, kept_bytes: int) -> list[Message]:
@@ -98,7 +94,7 @@ def quaternion(scale: float) -> Callable[[Any], None]:
         (
             [(LEFT, *of(GYRO)[0][1:]), (GYRO, *of(LEFT)[0][1:]), *DRIVE],
             (0, 0, 0),
-            "another type /cam0/image_raw: sensor_msgs/Imu left out",
+            f"another type {LEFT}: sensor_msgs/Imu left out",
         ),
     ],
 )
@@ -140,8 +136,11 @@ def test_a_lens_that_changes_leaves_its_frames_out(
 
 def always_zooming() -> list[Message]:
     lenses = [replace(LENS, intrinsics_px=LENS.intrinsics_px * (1 + 0.01 * number)) for number in range(25)]
-    encoded = [ros_messages.encode_camera_info(number, "cam0_optical", lens) for number, lens in enumerate(lenses)]
-    return without(INFO) + [(INFO, "sensor_msgs/CameraInfo", number, data) for number, data in enumerate(encoded)]
+    return without(INFO) + [info(INFO, number, lens) for number, lens in enumerate(lenses)]
+
+
+def info(topic: str, stamp_ns: int, lens: CameraCalibration, frame: str = "cam0_optical") -> Message:
+    return topic, "sensor_msgs/CameraInfo", stamp_ns, ros_messages.encode_camera_info(stamp_ns, frame, lens)
 
 
 def setting(
@@ -183,7 +182,7 @@ def test_binning_and_roi_are_used(
 
 def test_a_camera_frame_with_the_axes_of_a_body_is_noted(tmp_path: Path) -> None:
     """As of a driver that stamps images with camera_link in place of camera_color_optical_frame."""
-    lens = (INFO, "sensor_msgs/CameraInfo", 1, ros_messages.encode_camera_info(1, "cam_link", LENS))
+    lens = info(INFO, 1, LENS, "cam_link")
     turned = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     for base_from_cam, is_noted in ((np.eye(4), True), (turned, False)):
         links = ros_messages.encode_frame_links(1, [ros_messages.FrameLink("base_link", "cam_link", base_from_cam)])
@@ -197,9 +196,7 @@ def camera(*topics: str, focal_scale: float = 1.0) -> list[Message]:
     found: list[Message] = []
     lens = replace(LENS, intrinsics_px=LENS.intrinsics_px * [focal_scale, focal_scale, 1, 1])
     for topic, (row, stamp_ns) in product(topics, enumerate(STAMPS_NS)):
-        info = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        data = ros_messages.encode_camera_info(stamp_ns, "cam0_optical", lens)
-        found.append((info, "sensor_msgs/CameraInfo", stamp_ns, data))
+        found.append(info(f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info", stamp_ns, lens))
         if "depth" in topic or "compressed" in topic:
             pixels = np.full((HEIGHT, WIDTH), 2000, np.uint16) if "depth" in topic else SAMPLE.left[row]
             image = StoredImage("file", cv2.imencode(".png", pixels)[1].tobytes())
@@ -226,6 +223,10 @@ def late(late_ns: int) -> Callable[[Any], None]:
     return change
 
 
+LATE = "the second is {} ms from the first.*5 ms are allowed"
+UNALIGNED = camera(COLOR) + camera(DEPTH, focal_scale=0.8)
+
+
 @pytest.mark.parametrize(
     ("messages", "says"),
     [
@@ -235,14 +236,8 @@ def late(late_ns: int) -> Callable[[Any], None]:
         (always_zooming(), r"/cam0/camera_info describes more than 20 lenses.*autofocus"),
         (setting((2, 2), (0, 0, 0, 0), (100, 80)), r"100x80 px, which.*binning 2 x 2\) does not make.*roi"),
         (setting((1, 1), (116, 68, 120, 100), (100, 50)), r"100x50 px.*roi 120x100 at \(116, 68\)"),
-        (
-            edited(DRIVE, RIGHT, late(12_000_000)),
-            r"the second is \+(11\.999|12\.00[01]) ms from the first.*5 ms are allowed: trigger",
-        ),
-        (
-            edited(DRIVE, RIGHT, late(FRAME_NS // 2)),
-            r"the second is [+-]\d\d\.\d\d\d ms from the first.*5 ms are allowed",
-        ),
+        (edited(DRIVE, RIGHT, late(12_000_000)), LATE.format(r"\+(11\.999|12\.00[01])") + ": trigger"),
+        (edited(DRIVE, RIGHT, late(FRAME_NS // 2)), LATE.format(r"[+-]\d\d\.\d\d\d")),
         (REPEATED, r"imu: .* stamps repeat.*let it stamp each one"),
         (camera(*PAIRS), r"--topic left=/NAME. There is .*/front/left/image_raw .*/rear/left/image_raw"),
         (camera(*INFRA, COLOR) + of(TF), "the pose of the right camera is unknown"),
@@ -256,30 +251,14 @@ def test_a_value_that_nothing_stands_in_for_is_named(tmp_path: Path, messages: l
 @pytest.mark.parametrize(
     ("messages", "used", "says"),
     [
-        (
-            camera(COLOR, DEPTH, ALIGNED),
-            "mono",
-            f"images not used .*{ALIGNED}, {DEPTH}; {COLOR} is used.*--topic.*depth=/NAME",
-        ),
+        (camera(COLOR, DEPTH, ALIGNED), "mono", f"images not used .*{ALIGNED}, {DEPTH}; {COLOR} is used.*depth=/NAME"),
         (camera(COLOR, ALIGNED), "rgbd", ""),
-        (
-            camera(COLOR) + camera(DEPTH, focal_scale=0.8),
-            "rgbd",
-            f"depth not registered {DEPTH} .* not that of {COLOR} .*depth=/NAME",
-        ),
+        (UNALIGNED, "rgbd", f"depth not registered {DEPTH} .* not that of {COLOR} .*depth=/NAME"),
         (camera(COLOR, f"{COLOR}/compressed"), "mono", f"{COLOR}/compressed; {COLOR} is used"),
         (camera("/d/left/image_raw", "/d/left/image_rect"), "mono", "/d/left/image_rect; /d/left/image_raw is used"),
         (camera(LEFT, f"{LEFT}/compressed"), "mono", "/cam0/image_raw/compressed; .* is used"),
-        (
-            without(GYRO) + renamed(GYRO, "/a/imu") + renamed(GYRO, "/b/imu"),
-            "stereo",
-            "imu not chosen /a/imu, /b/imu could be it; name.*--topic imu=/NAME",
-        ),
-        (
-            without(WHEEL) + renamed(WHEEL, "/a/odom") + renamed(WHEEL, "/b/odom"),
-            "stereo-inertial",
-            "wheel not chosen /a/odom, /b/odom could be it",
-        ),
+        (twice(GYRO, "/a/imu", "/b/imu"), "stereo", "imu not chosen /a/imu, /b/imu could be it; name.*imu=/NAME"),
+        (twice(WHEEL, "/a/odom", "/b/odom"), "stereo-inertial", "wheel not chosen /a/odom, /b/odom could be it"),
         (foreign_messages() + camera(COLOR), "stereo-inertial", f"{COLOR}; /cam0/image_raw, /cam1/image_raw are used"),
         (DRIVE + of(GYRO)[7:8], "stereo-inertial", "imu: stamps repeated 1 of .* the first is"),
     ],

@@ -41,10 +41,8 @@ def test_the_same_sensors_give_the_same_samples_through_mcap_and_bag(
 
 def test_ros_1_messages_in_mcap(tmp_path: Path) -> None:
     """As `mcap convert` makes them of a bag."""
-    with (
-        Reader(write_rosbag1(tmp_path / "a.bag", foreign_messages())) as reader,
-        (tmp_path / "a.mcap").open("wb") as file,
-    ):
+    bag = write_rosbag1(tmp_path / "a.bag", foreign_messages())
+    with Reader(bag) as reader, (tmp_path / "a.mcap").open("wb") as file:
         writer = McapWriter(file)
         writer.start(profile="ros1", library="test")
         channels = {}
@@ -69,8 +67,7 @@ def test_messages_of_one_moment_are_told_apart(tmp_path: Path) -> None:
 
 def spoiled(path: Path, before: bytes, after: bytes) -> Path:
     data = path.read_bytes()
-    assert data.count(before) >= 1
-    assert len(before) == len(after)
+    assert before in data and len(before) == len(after)
     path.write_bytes(data.replace(before, after))
     return path
 
@@ -119,9 +116,7 @@ def test_other_definitions_and_types_are_not_guessed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["bz2", "lz4"])
 def test_a_chunk_unpacks_to_no_more_than_its_limit(tmp_path: Path, kind: str) -> None:
     image = [m for m in foreign_messages() if m[0] == "/cam0/image_raw"][:1]
-    topic, name, stamp_ns, data = image[0]
-    form = Writer.CompressionFormat[kind.upper()]
-    bag = write_rosbag1(tmp_path / "a.bag", [(topic, name, stamp_ns, data)], form)
+    bag = write_rosbag1(tmp_path / "a.bag", image, Writer.CompressionFormat[kind.upper()])
     sound = bag.read_bytes()
     at = sound.index(b"compression=" + kind.encode())
     size_at = sound.index(b"size=", at) + 5 + 4  # the uncompressed size, then that of the data
@@ -156,8 +151,8 @@ def test_an_index_that_counts_a_chunk_again_and_again_is_refused(tmp_path: Path)
     data = bag.read_bytes()
     (count,) = struct.unpack_from("<I", data, data.index(b"chunk_count=") + 12)
     infos = [m.start() for m in re.finditer(rb"chunk_pos=", data)]
-    first = data[data.rindex(b"\x04\x00\x00\x00op=\x06", 0, infos[0]) - 4 :] if count == 1 else None
-    assert first is not None, "one chunk, whose place in the index is the rest of the file"
+    assert count == 1, "one chunk, whose place in the index is the rest of the file"
+    first = data[data.rindex(b"\x04\x00\x00\x00op=\x06", 0, infos[0]) - 4 :]
     at = data.index(b"chunk_count=") + 12
     bag.write_bytes(data[:at] + struct.pack("<I", 400) + data[at + 4 :] + 399 * first)
     with pytest.raises(RecordingError, match="index is larger than the file"):

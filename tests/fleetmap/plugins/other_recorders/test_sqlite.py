@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 
 from fleetmap.errors import RecordingError, UsageError
+from fleetmap.plugins.other_recorders.sqlite import SqliteFiles
 from fleetmap.recordings import OpenOptions, Topics, named_topics, open_recording
 from support.recordings.bag_samples import assert_same, write_rosbag2
 from support.recordings.mcap_samples import SAMPLE, foreign_messages
@@ -187,15 +188,9 @@ def test_rosbag2s_own_bags_are_opened_and_say_what_they_hold(storage: str, name:
 
 @pytest.mark.parametrize("name", ["cdr_test", "bag_with_topics_and_service_events"])
 def test_rosbag2s_own_bags_give_the_same_messages_as_by_rosbags(name: str) -> None:
-    from rosbags.rosbag2 import Reader
-
-    from fleetmap.plugins.other_recorders.sqlite import SqliteFiles
-
     bag = real_data("conformance/rosbag2") / "rosbag2_tests/resources/sqlite3" / name
     ours = SqliteFiles(sorted(bag.glob("*.db3")))
-    found = [
-        (channel.topic, stamp_ns, bytes(data), ours.read(place)) for channel, stamp_ns, place, data in ours.messages()
-    ]
+    found = [(each.topic, stamp_ns, bytes(data), ours.read(place)) for each, stamp_ns, place, data in ours.messages()]
     ours.close()
     with Reader(bag) as reader:
         theirs = [(connection.topic, stamp_ns, bytes(data)) for connection, stamp_ns, data in reader.messages()]

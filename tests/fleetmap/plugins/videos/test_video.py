@@ -120,9 +120,8 @@ def test_files_that_are_no_video(tmp_path: Path, rig: OpenOptions) -> None:
 def test_other_videos_are_told_how_to_become_one(tmp_path: Path, rig: OpenOptions) -> None:
     for name in ("a.avi", "a.mkv", "a.h264"):
         (tmp_path / name).write_bytes(bytes(100))
-        with pytest.raises(
-            RecordingError, match=rf"`ffmpeg -i .*{name} -c copy .*a\.mp4` makes a video that can be read"
-        ):
+        says = rf"`ffmpeg -i .*{name} -c copy .*a\.mp4` makes a video that can be read"
+        with pytest.raises(RecordingError, match=says):
             open_recording(tmp_path / name, rig)
 
 

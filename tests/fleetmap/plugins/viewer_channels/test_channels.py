@@ -12,7 +12,7 @@ from fleetmap.messages import FailureReport, Placement
 from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import CHANNELS, RobotMark
 from fleetmap.sensors.rectification import StereoCamera
-from support.fleet.contracts_documents import REPOSITORY
+from support.fleet.contracts_documents import text
 from support.fleet.foxglove_schemas import decoded, matrix, xyz
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -45,7 +45,7 @@ def test_frames_and_robots_stand_where_they_are() -> None:
     link = decoded(channels.links(STAMP_NS, [("map", "odom", TURNED)])).transforms[0]
     assert (link.parent_frame_id, link.child_frame_id, ns(link.timestamp)) == ("map", "odom", STAMP_NS)
     np.testing.assert_allclose(xyz(link.translation), TURNED[:3, 3])
-    turn = np.array([link.rotation.w, link.rotation.x, link.rotation.y, link.rotation.z])
+    turn = np.array([getattr(link.rotation, axis) for axis in "wxyz"])
     np.testing.assert_allclose(rotation_from_quat_wxyz(turn), TURNED[:3, :3], atol=1e-12)
     marks = [RobotMark("a", TURNED, "TRACKING"), RobotMark("b", np.eye(4), "LOST")]
     scene = decoded(channels.robots(STAMP_NS, marks))
@@ -106,7 +106,7 @@ def test_a_failure_nowhere_has_no_place() -> None:
 
 # The layout in `deploy/` shows channels that there are, and every panel stands in it.
 
-TEXT = (REPOSITORY / "deploy" / "foxglove-layout.json").read_text("utf-8")
+TEXT = text("deploy/foxglove-layout.json")
 
 
 def test_it_shows_every_channel_that_there_is() -> None:

@@ -2,6 +2,7 @@
 
 import resource
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,8 @@ from support.recordings.mcap_samples import IMU, SAMPLE
 from support.recordings.recording_samples import calibration
 
 WHEEL = WheelSample(int(SAMPLE.stamps_ns[1]), np.array([0.5, 0.01, 0.0]), 0.25, 0.02, 0.03)
-PRIOR = PositionPrior(
-    int(SAMPLE.stamps_ns[0]),
-    se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([1.0, 2.0, 0.0])),
-    np.diag([np.inf, np.inf, 0.1, 0.04, 0.05, np.inf]),
-)
+PLACE = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([1.0, 2.0, 0.0]))
+PRIOR = PositionPrior(int(SAMPLE.stamps_ns[0]), PLACE, np.diag([np.inf, np.inf, 0.1, 0.04, 0.05, np.inf]))
 TRUTH = Trajectory(SAMPLE.stamps_ns, np.stack(SAMPLE.world_from_body))
 
 
@@ -80,10 +78,8 @@ def test_a_full_disk_is_named_and_leaves_no_part(tmp_path: Path, count: int) -> 
     frame = CameraFrame(1, np.zeros((700, 1000), np.uint8), np.zeros((700, 1000), np.uint8))
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
-        with (
-            pytest.raises(RecordingError, match=r"a\.mcap\.part cannot be written .*make space"),
-            McapRecordingWriter(path, calibration()) as writer,
-        ):
+        full = pytest.raises(RecordingError, match=r"a\.mcap\.part cannot be written .*make space")
+        with full, McapRecordingWriter(path, calibration()) as writer:
             for _ in range(count):
                 writer.write_frame(frame)
         with pytest.raises(RecordingError, match=r"b\.mcap cannot be written .*it holds what came before"):
@@ -122,19 +118,13 @@ def test_the_ros_2_decoder_of_others_reads_every_message(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("topics", "says"),
     [
-        (
-            Topics(left="/front"),
-            "no topic /front of type sensor_msgs/Image or .* for --topic left; there is .*/cam0/image_raw",
-        ),
+        (Topics(left="/front"), "no topic /front of type sensor_msgs/Image or .* for --topic left; there is .*/cam0/"),
         (Topics(wheel="/wheels"), "no topic /wheels of type nav_msgs/Odometry for --topic wheel"),
         (Topics(wheel="", imu=""), ""),
     ],
 )
 def test_topics_that_were_named_must_be_there(tmp_path: Path, topics: Topics, says: str) -> None:
     path = write(tmp_path / "a.mcap")
-    if says:
-        with pytest.raises(RecordingError, match=says):
-            reader.open_mcap(path, OpenOptions(topics=topics))
-        return
-    with reader.open_mcap(path, OpenOptions(topics=topics)) as recording:
+    refused = pytest.raises(RecordingError, match=says) if says else nullcontext()
+    with refused, reader.open_mcap(path, OpenOptions(topics=topics)) as recording:
         assert (recording.wheel, len(recording.imu), recording.sensor_set) == ((), 0, SensorSet.STEREO)
