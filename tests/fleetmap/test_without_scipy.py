@@ -12,14 +12,11 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings
 from support.worlds.inertial_motion import sample_motion
-from support.worlds.textured_room import mounted, stereo_frame
+from support.worlds.textured_room import driven, mounted, stereo_frame
 
+frames = (stereo_frame(k * 50_000_000) for k in [*range(1, 30), 37, 38])
 odometry = Odometry(mounted(ImuNoise()), OdometrySettings())
-samples, fed_ns = sample_motion(rate_hz=200.0, duration_s=3.0), 0
-for stamp_ns in [k * 50_000_000 for k in [*range(1, 30), 37, 38]]:
-    odometry.handle_imu(samples.between(fed_ns, stamp_ns + 1))
-    fed_ns = stamp_ns + 1
-    estimate = odometry.handle_stereo(stereo_frame(stamp_ns))
+*_, estimate = driven(odometry, frames, sample_motion(rate_hz=200.0, duration_s=3.0))
 assert estimate.inertial, estimate
 print("status", estimate.status)
 """

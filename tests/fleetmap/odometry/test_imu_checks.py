@@ -11,26 +11,22 @@ from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.settings import OdometrySettings
-from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples
-from support.worlds.inertial_motion import analytic_motion
+from support.worlds.inertial_motion import moved_between
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import mounted, stereo_frame
+from support.worlds.textured_room import FRAME_NS, IMU, driven, mounted, stereo_frame
 
-FRAME_NS = 50_000_000
-IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 SAMPLES = noisy_imu(np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.1, 0.2]))
 
 
 def fault(by_accel: Array | float, away: Array | None = None) -> str:
     """What is found in six seconds; away (6,): sigma of the images' motion from frame to frame."""
     check, rng = AccelerometerCheck(np.eye(4)), np.random.default_rng(2)
-    imu = replace(
-        SAMPLES, accel_mps2=SAMPLES.accel_mps2 @ (np.eye(3) * by_accel if np.ndim(by_accel) < 2 else by_accel)
-    )
+    changed = np.eye(3) * by_accel if np.ndim(by_accel) < 2 else by_accel
+    imu = replace(SAMPLES, accel_mps2=SAMPLES.accel_mps2 @ changed)
     for k in range(1, 120):
-        before, now = (analytic_motion(n * FRAME_NS * 1e-9).map_from_body for n in (k - 1, k))
-        moved = se3_inverse(before) @ now
+        moved = moved_between((k - 1) * FRAME_NS * 1e-9, k * FRAME_NS * 1e-9)
         if away is not None:
             noise = away * rng.normal(size=6)
             moved = moved @ se3(so3_exp(noise[:3]), noise[3:])
@@ -131,22 +127,22 @@ def test_clocks_that_are_said_to_be_exact_are_not_accused_of_nothing(limit_s: fl
 
 @pytest.mark.parametrize(("wrong", "frames"), [("accelerometer", 80), ("clock", 50)])
 def test_the_odometry_goes_on_without_what_is_wrong(wrong: str, frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    odometry, fed_ns, estimates = Odometry(mounted(IMU), OdometrySettings()), 0, []
+    odometry = Odometry(mounted(IMU), OdometrySettings())
     imu = replace(SAMPLES, accel_mps2=-SAMPLES.accel_mps2) if wrong == "accelerometer" else SAMPLES
-    for k in range(1, frames + 1):
-        if k == 30 and wrong == "clock":
+
+    def spoil(_: Odometry, frame: RectifiedFrame) -> None:
+        if frame.stamp_ns == 30 * FRAME_NS and wrong == "clock":
             monkeypatch.setattr(GyroClock, "_judge", lambda clock, _: setattr(clock, "off_s", 0.1))
-        odometry.handle_imu(imu.between(fed_ns, k * FRAME_NS + 1))
-        fed_ns = k * FRAME_NS + 1
-        estimates.append(odometry.handle_stereo(stereo_frame(k * FRAME_NS)))
+
+    estimates = driven(odometry, (stereo_frame(k * FRAME_NS) for k in range(1, frames + 1)), imu, spoil)
     assert ("wrong sign" in odometry.accelerometer.fault) == (wrong == "accelerometer")
     assert odometry.refuses_imu == (wrong == "clock")
     assert odometry.clock.off_s == (0.1 if wrong == "clock" else None)
     assert estimates[25].inertial or wrong == "accelerometer"
     assert not estimates[-1].inertial
-    first, last = (analytic_motion(n * FRAME_NS * 1e-9).map_from_body for n in (frames - 9, frames))
     moved = se3_inverse(estimates[-10].odom_from_body) @ estimates[-1].odom_from_body
-    np.testing.assert_allclose(moved, se3_inverse(first) @ last, atol=0.03)
+    truth = moved_between((frames - 9) * FRAME_NS * 1e-9, frames * FRAME_NS * 1e-9)
+    np.testing.assert_allclose(moved, truth, atol=0.03)
 
 
 STILL = np.eye(4)

@@ -1,6 +1,6 @@
 """The odometry on pictures of a painted room, with exact truth."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -15,7 +15,6 @@ from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.filter.msckf import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
-from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings, TrackerSettings
@@ -27,36 +26,31 @@ from locclient.localization.place import ORIGIN
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
 from mapserver.survey.odometry_pass import FrameChain
-from support.worlds.inertial_motion import analytic_motion
+from support.worlds.inertial_motion import analytic_motion, moved_between
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, mounted, stereo_frame, view
-
-IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
-FRAME_NS = 50_000_000
+from support.worlds.textured_room import (
+    BODY_FROM_CAM,
+    CAMERA,
+    FRAME_NS,
+    IMU,
+    black_frame,
+    driven,
+    mounted,
+    pair,
+    stereo_frame,
+)
 
 
 def run(
-    frames: Iterable[RectifiedFrame], imu: ImuNoise | None, filtering: FilterSettings | None = None,
-    before: Callable[[Odometry, RectifiedFrame], None] = lambda *_: None,
-) -> tuple[Odometry, list[OdometryEstimate]]:  # fmt: skip
-    """before: something done before each frame."""
-    settings = OdometrySettings(filter=filtering or FilterSettings())
-    odometry = Odometry(mounted(imu), settings)
-    samples = noisy_imu(
-        np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
-    )
-    estimates, fed_ns = [], 0
-    for frame in frames:
-        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
-        fed_ns = frame.stamp_ns + 1
-        before(odometry, frame)
-        estimates.append(odometry.handle_stereo(frame))
-    return odometry, estimates
+    frames: Iterable[RectifiedFrame], imu: ImuNoise | None, filtering: FilterSettings | None = None, **how: Any
+) -> tuple[Odometry, list[OdometryEstimate]]:
+    odometry = Odometry(mounted(imu), OdometrySettings(filter=filtering or FilterSettings()))
+    biases = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
+    return odometry, driven(odometry, frames, noisy_imu(np.random.default_rng(1), 6.5, IMU, *biases), **how)
 
 
 def truth_between(first_ns: int, second_ns: int) -> Array:
-    first, second = (analytic_motion(s * 1e-9).map_from_body for s in (first_ns, second_ns))
-    return np.asarray(se3_inverse(first) @ second)
+    return moved_between(first_ns * 1e-9, second_ns * 1e-9)
 
 
 def relative_error(a: OdometryEstimate, b: OdometryEstimate) -> Array:
@@ -67,7 +61,6 @@ def relative_error(a: OdometryEstimate, b: OdometryEstimate) -> Array:
 
 def step_error_m(before: OdometryEstimate, after: OdometryEstimate) -> float:
     """Error of the motion between two successive frames, whether `odom` restarted or not."""
-    assert after.previous_from_body is not None
     error = se3_inverse(truth_between(before.stamp_ns, after.stamp_ns)) @ after.previous_from_body
     return float(np.linalg.norm(error[:3, 3]))
 
@@ -93,10 +86,8 @@ def test_inertial_starts_in_motion_and_follows(inertial: tuple[Odometry, list[Od
     assert estimates[0].status is OdometryStatus.INITIALISING
     assert not estimates[started - 1].inertial
     assert all(e.status is OdometryStatus.TRACKING and e.inertial for e in estimates[started + 1 :])
-    path_m = sum(
-        float(np.linalg.norm(truth_between(a.stamp_ns, b.stamp_ns)[:3, 3]))
-        for a, b in zip(estimates[started:], estimates[started + 1 :], strict=False)
-    )
+    steps = (truth_between(a.stamp_ns, b.stamp_ns) for a, b in pairwise(estimates[started:]))
+    path_m = sum(float(np.linalg.norm(step[:3, 3])) for step in steps)
     error = relative_error(estimates[started + 1], estimates[-1])
     assert np.linalg.norm(error[3:]) < 0.012 * path_m
     assert np.degrees(np.linalg.norm(error[:3])) < 0.8  # 0.2 to 0.7, by which corners are followed
@@ -116,12 +107,9 @@ def test_odom_is_level_and_the_velocity_right(inertial: tuple[Odometry, list[Odo
 def test_redefining_odom_carries_the_past_along(inertial: tuple[Odometry, list[OdometryEstimate]]) -> None:
     _, estimates = inertial
     started = next(k for k, e in enumerate(estimates) if e.new_odom_from_old_odom is not None)
-    change = estimates[started].new_odom_from_old_odom
-    assert change is not None
-    carried = change @ estimates[started - 1].odom_from_body
-    moved = se3_inverse(carried) @ estimates[started].odom_from_body
-    off = se3_log(se3_inverse(truth_between(estimates[started - 1].stamp_ns, estimates[started].stamp_ns)) @ moved)
-    assert np.linalg.norm(off[3:]) < 0.02
+    before, now = estimates[started - 1 : started + 1]
+    carried = replace(before, odom_from_body=now.new_odom_from_old_odom @ before.odom_from_body)
+    assert np.linalg.norm(relative_error(carried, now)[3:]) < 0.02
 
 
 def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
@@ -143,19 +131,16 @@ def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]
 def test_the_motion_since_a_frame_is_known_although_it_was_dropped_with_the_next() -> None:
     """Slowly: most frames are hardly elsewhere than the one before, and are not kept."""
     odometry = Odometry(mounted(None), OdometrySettings())
-    slow_ns, dropped = FRAME_NS // 10, 0
-    frames = [stereo_frame(k * slow_ns) for k in range(1, 41)]
+    first, *frames = [stereo_frame(k * FRAME_NS // 10) for k in range(1, 41)]
+    odometry.handle_stereo(first)
+    dropped = 0
     for number, frame in enumerate(frames):
-        estimate = odometry.handle_stereo(frame)
-        if not number:
-            continue
-        since = odometry.motion_since(number - 1)
-        assert since is not None, number
-        off = se3_log(se3_inverse(truth_between(frames[number - 1].stamp_ns, estimate.stamp_ns)) @ since[0])
-        sigmas = np.sqrt(np.diag(since[1]))
+        odometry.handle_stereo(frame)
+        motion, covariance = odometry.motion_since(number)
+        off = se3_log(se3_inverse(truth_between(frame.stamp_ns - FRAME_NS // 10, frame.stamp_ns)) @ motion)
         assert np.linalg.norm(off[3:]) < 0.01
-        assert (np.abs(off) < 5.0 * sigmas + 1e-3).all()
-        dropped += number > 1 and odometry.will_forget(number - 1)
+        assert (np.abs(off) < 5.0 * np.sqrt(np.diag(covariance)) + 1e-3).all()
+        dropped += number > 0 and odometry.will_forget(number)
     assert dropped > 10
 
 
@@ -212,9 +197,7 @@ def test_a_filter_that_is_locked_in_a_wrong_speed_says_so_and_opens_it() -> None
     def frame(k: int) -> RectifiedFrame:
         map_from_body = analytic_motion(k * FRAME_NS * 1e-9).map_from_body.copy()
         map_from_body[:2, 3] += [jump_m, off_mps * (k - at) * FRAME_NS * 1e-9] if k >= at else [0.0, 0.0]
-        cam = map_from_body @ BODY_FROM_CAM
-        right = cam @ se3(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
-        return RectifiedFrame(k * FRAME_NS, view(cam), view(right), None)
+        return pair(k * FRAME_NS, map_from_body)
 
     _, estimates = run((frame(k) for k in range(1, 66)), IMU)
     after = estimates[at:]
@@ -330,7 +313,6 @@ def test_tracks_are_where_the_points_went() -> None:
     expected = CAMERA.pixel_from_point(points[at_first] @ cam_from_first[:3, :3].T + cam_from_first[:3, 3])
     off = np.linalg.norm((expected - tracked.pixels[at_last])[:, :2], axis=1)
     assert np.nanmedian(off) < 0.5
-    assert tracked.cam_from_previous is not None
     step = se3_inverse(BODY_FROM_CAM) @ se3_inverse(truth_between(4 * FRAME_NS, 5 * FRAME_NS)) @ BODY_FROM_CAM
     assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))[3:]) < 0.01
 
@@ -339,15 +321,13 @@ def test_a_prediction_may_be_wrong() -> None:
     """Predicted well, points are followed from one level above the image; predicted badly, from all of them, and held all the same."""
     step = se3_inverse(se3_inverse(BODY_FROM_CAM) @ truth_between(FRAME_NS, 2 * FRAME_NS) @ BODY_FROM_CAM)
     # 14 px to the side: more than what one level above the picture can make good
-    turned = np.eye(4)
-    turned[:3, :3] = so3_exp(np.array([0.0, 14.0 / CAMERA.focal_px, 0.0]))
+    turned = se3(so3_exp(np.array([0.0, 14.0 / CAMERA.focal_px, 0.0])), np.zeros(3))
     held = []
     for predicted, sigma_rad in ((step, 0.01), (turned @ step, 0.01), (step, None)):
         tracker = Tracker(CAMERA, TrackerSettings())
         first = tracker.track(stereo_frame(FRAME_NS), lambda _: None, sigma_rad)
         tracked = tracker.track(stereo_frame(2 * FRAME_NS), lambda _, predicted=predicted: predicted, sigma_rad)
         held.append(int(np.isin(tracked.ids, first.ids).sum()))
-        assert tracked.cam_from_previous is not None
         assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
     assert min(held) > 0.9 * max(held)
 
@@ -355,8 +335,7 @@ def test_a_prediction_may_be_wrong() -> None:
 def test_a_guess_beyond_the_flow_is_mended_by_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Points come to lie 100 px from where a guess has them: flow finds edges there that agree on another motion."""
     step = se3_inverse(se3_inverse(BODY_FROM_CAM) @ truth_between(FRAME_NS, 2 * FRAME_NS) @ BODY_FROM_CAM)
-    turned = np.eye(4)
-    turned[:3, :3] = so3_exp(np.array([0.0, 100.0 / CAMERA.focal_px, 0.0]))
+    turned = se3(so3_exp(np.array([0.0, 100.0 / CAMERA.focal_px, 0.0])), np.zeros(3))
     described, motions = [], [step, turned @ step]
     remember = Tracker._remember
     monkeypatch.setattr(Tracker, "_remember", lambda *of: described.append(of[-1]) or remember(*of))  # type: ignore[func-returns-value]
@@ -366,7 +345,6 @@ def test_a_guess_beyond_the_flow_is_mended_by_descriptors(monkeypatch: pytest.Mo
         tracked = tracker.track(stereo_frame(2 * FRAME_NS), lambda _, guess=guess: guess)
         assert len(described) == 2 * number, "costs nothing where the flow holds"
         assert np.isin(first.ids, tracked.ids).mean() > 0.7
-        assert tracked.cam_from_previous is not None
         assert not tracked.by_descriptors
         assert np.linalg.norm(se3_log(tracked.cam_from_previous @ se3_inverse(step))) < 0.02
 
@@ -434,9 +412,8 @@ def test_wheels_of_a_rig_without_imu_are_not_collected() -> None:
     odometry = Odometry(mounted(None), OdometrySettings())
     period_ns = FRAME_NS // 5
     for k in range(1, 21):
-        odometry.handle_wheel(
-            [WheelSample(k * FRAME_NS - n * period_ns, np.zeros(3), 0.0, 0.02, 0.02) for n in range(4, -1, -1)]
-        )
+        stamps_ns = (k * FRAME_NS - n * period_ns for n in range(4, -1, -1))
+        odometry.handle_wheel([WheelSample(stamp_ns, np.zeros(3), 0.0, 0.02, 0.02) for stamp_ns in stamps_ns])
         odometry.handle_stereo(black_frame(k * FRAME_NS))
         assert len(odometry._samples._wheel) < 15
 
@@ -448,8 +425,7 @@ def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
     def spoil(odometry: Odometry, frame: RectifiedFrame) -> None:
         if frame.stamp_ns != 40 * FRAME_NS:
             return
-        mode = odometry._mode
-        assert isinstance(mode, InertialMode)
+        mode: Any = odometry._mode
         if broken == "clocks":
             mode.window.filter.imu_minus_cam_s = 0.09
         else:  # by a blow that no noise covers
@@ -466,12 +442,9 @@ def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
     np.testing.assert_array_equal(said[began[0]].new_odom_from_old_odom, np.eye(4))
     assert said[-1].inertial, "gravity was found again"
     again = next(n for n in range(began[0], len(said)) if said[n].inertial)
-    error = relative_error(said[again], said[-1])
-    assert np.linalg.norm(error[3:]) < 0.05
-    steps_m = [
-        np.linalg.norm((b.odom_from_body - a.odom_from_body)[:3, 3]) for a, b in pairwise(said[began[0] : again])
-    ]
-    assert max(steps_m) < 0.3
+    assert np.linalg.norm(relative_error(said[again], said[-1])[3:]) < 0.05
+    places_m = np.array([each.odom_from_body[:3, 3] for each in said[began[0] : again]])
+    assert np.linalg.norm(np.diff(places_m, axis=0), axis=1).max() < 0.3
 
 
 @pytest.mark.parametrize("imu", [IMU, None])

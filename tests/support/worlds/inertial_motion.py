@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated
 from fleetmap.sensors.samples import ImuSamples
 
@@ -40,6 +40,11 @@ def analytic_motion(time_s: float) -> Motion:
     return Motion(se3(rotation, position), velocity, gyro, rotation.T @ (acceleration - GRAVITY))
 
 
+def moved_between(first_s: float, second_s: float) -> Array:
+    """first_from_second (4, 4) of the body."""
+    return se3_inverse(analytic_motion(first_s).map_from_body) @ analytic_motion(second_s).map_from_body
+
+
 @lru_cache(maxsize=100_000)
 def _felt(stamp_ns: int) -> tuple[Array, Array]:
     state = analytic_motion(stamp_ns * 1e-9)
@@ -51,10 +56,9 @@ def sample_motion(
 ) -> ImuSamples:
     """Noise-free samples from time 0 to `duration_s`, both included."""
     stamps = np.round(np.arange(round(duration_s * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
-    gyro, accel = np.array([_felt(int(s)) for s in stamps]).transpose(1, 0, 2)
-    return ImuSamples(
-        stamps, gyro + (0 if gyro_bias is None else gyro_bias), accel + (0 if accel_bias is None else accel_bias)
-    )
+    felt = np.array([_felt(int(s)) for s in stamps]).transpose(1, 0, 2)
+    biases = (np.zeros(3) if bias is None else bias for bias in (gyro_bias, accel_bias))
+    return ImuSamples(stamps, *(values + bias for values, bias in zip(felt, biases, strict=True)))
 
 
 def corrected(summed: Preintegrated, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array, Array]:

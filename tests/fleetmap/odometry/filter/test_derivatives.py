@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.inertial import imu_intervals
 from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.sensors.calibration import ImuNoise
@@ -83,9 +83,7 @@ def test_track_jacobians_are_numeric_derivatives(with_mono: bool) -> None:
         index, sides = clones[k // 6], []
         for sign in (1, -1):
             error, changed = sign * step * np.eye(6)[k % 6], bodies.copy()
-            turn = so3_exp(error[:3])
-            changed[index, :3, :3] = turn @ bodies[index, :3, :3]
-            changed[index, :3, 3] = turn @ bodies[index, :3, 3] + error[3:]
+            changed[index] = se3(so3_exp(error[:3]), error[3:]) @ bodies[index]
             sides.append(residuals(changed, point)[0])
         np.testing.assert_allclose(by_clone[:, k], -(sides[0] - sides[1]) / (2 * step), atol=1e-4)
     for k in range(3):
@@ -115,10 +113,7 @@ def test_triangulation_finds_the_point_from_a_poor_start() -> None:
     cams = bodies @ BODY_FROM_CAM
     target = cams[0, :3, 3] + cams[0, :3, :3] @ np.array([0.5, -0.3, 4.0])
     pixels = np.array([CAMERA.pixel_from_point(transform_points(se3_inverse(c), target[None]))[0] for c in cams])
-    for mono in (False, True):
-        given = pixels.copy()
-        if mono:
-            given[:, 2] = np.nan
+    for given in (pixels, pixels * [1.0, 1.0, np.nan]):
         found = cams[0, :3, 3] + cams[0, :3, :3] @ np.array([0.25, -0.15, 2.5])
         found = core.triangulate(cams, np.arange(3), given, np.tile(CAMERA.lens, (3, 1)), *WEIGHTS, found)
         np.testing.assert_allclose(found, target, atol=1e-3)

@@ -70,11 +70,9 @@ def test_a_turn_on_the_spot_is_no_motion() -> None:
 def test_the_window_finds_the_truth_and_leaves_what_is_held() -> None:
     rng = np.random.default_rng(7)
     points = cloud(rng, 80)
-    truth = [
-        se3(so3_exp(np.array([0.0, 0.02 * k, 0.01 * k])), np.array([0.15 * k, 0.02 * k, 0.05 * k])) for k in range(6)
-    ]
-    starts = 6 * np.arange(81)
-    views = np.tile(np.arange(6), 80)
+    way = np.arange(6.0)[:, None] * [0.0, 0.02, 0.01, 0.15, 0.02, 0.05]
+    truth = [se3(so3_exp(step[:3]), step[3:]) for step in way]
+    starts, views = 6 * np.arange(81), np.tile(np.arange(6), 80)
     each = np.array([seen(points, se3_inverse(t), rng, 0.0) for t in truth])  # (6, 80, 2)
     observed = starts, views, np.ascontiguousarray(each.transpose(1, 0, 2).reshape(-1, 2)), CAMERA.lens, 0.5, 2.5
     moved = np.array(truth)
@@ -100,9 +98,8 @@ def test_the_way_along_a_wall_is_right_up_to_scale() -> None:
     odometry = VisualOdometry(CAMERA, MonocularSettings())
     truth, found = [], {}
     for k in range(60):
-        map_from_cam = se3(
-            so3_exp(np.array([0.0, 0.004 * k, 0.0])), np.array([0.1 * k, 0.1 * np.sin(0.15 * k), 0.02 * k])
-        )
+        place = np.array([0.1 * k, 0.1 * np.sin(0.15 * k), 0.02 * k])
+        map_from_cam = se3(so3_exp(np.array([0.0, 0.004 * k, 0.0])), place)
         truth.append(map_from_cam[:3, 3])
         pixels = seen(points, se3_inverse(map_from_cam), rng, 0.2)
         with np.errstate(invalid="ignore"):

@@ -1,6 +1,7 @@
 """Odometry with one camera on pictures of a painted room: up to scale and labelled, metric with an IMU."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +21,9 @@ from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedF
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, mounted, rig, stereo_frame
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, FRAME_NS, IMU, driven, mounted, rig, stereo_frame
 
-IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
-FRAME_NS = 50_000_000
 SINGLE = replace(CAMERA, baseline_m=0.0)
 FRAMES = 90
 
@@ -40,16 +39,10 @@ def run(imu: ImuNoise | None) -> tuple[list[OdometryEstimate], dict[int, Array]]
     odometry = make_odometry(single(imu), OdometrySettings())
     assert isinstance(odometry, MonocularOdometry)
     samples = noisy_imu(np.random.default_rng(1), 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
-    estimates, placed, fed_ns = [], {}, 0
-    for k in range(1, FRAMES + 1):
-        pair = stereo_frame(k * FRAME_NS)
-        frame = RectifiedFrame(pair.stamp_ns, pair.left, None, None)
-        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
-        fed_ns = frame.stamp_ns + 1
-        estimate = odometry.handle_stereo(frame)
-        placed.update(dict(estimate.revised))
-        placed[estimate.frame_index] = estimate.odom_from_body
-        estimates.append(estimate)
+    frames = (replace(stereo_frame(k * FRAME_NS), right=None) for k in range(1, FRAMES + 1))
+    estimates, placed = driven(odometry, frames, samples), {}
+    for estimate in estimates:
+        placed |= dict(estimate.revised) | {estimate.frame_index: estimate.odom_from_body}
     return estimates, placed
 
 
@@ -64,8 +57,7 @@ def aligned(placed: dict[int, Array], first: int, *, with_scale: bool) -> tuple[
 
 
 def test_the_class_goes_by_the_camera() -> None:
-    both = make_odometry(mounted(None), OdometrySettings())
-    assert type(both) is Odometry
+    assert type(make_odometry(mounted(None), OdometrySettings())) is Odometry
 
 
 def test_pictures_alone_give_the_way_up_to_scale_and_say_so() -> None:
@@ -131,8 +123,7 @@ def test_a_steady_way_shows_no_scale() -> None:
     level = np.tile([0.0, 0.0, 9.81], (len(samples), 1)) + 0.02 * rng.normal(size=(len(samples), 3))
     still = replace(samples, gyro_radps=1e-3 * rng.normal(size=level.shape), accel_mps2=level)
     trajectory = Trajectory(np.round(times_s * 1e9).astype(np.int64), cams)
-    found = mono_inertial_initialization(trajectory, still, IMU, BODY_FROM_CAM, OdometrySettings())
-    assert found is None
+    assert mono_inertial_initialization(trajectory, still, IMU, BODY_FROM_CAM, OdometrySettings()) is None
 
 
 def standing() -> tuple[Odometry, RectifiedFrame]:
@@ -141,7 +132,7 @@ def standing() -> tuple[Odometry, RectifiedFrame]:
     stamps_ns = np.arange(0, int(6e9), 5_000_000)
     rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
     odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(rest), rest))
-    return odometry, RectifiedFrame(FRAME_NS, stereo_frame(FRAME_NS).left, None, None)
+    return odometry, replace(stereo_frame(FRAME_NS), right=None)
 
 
 @pytest.mark.parametrize("vibration_mps2", [0.0, 1.0])
@@ -170,17 +161,13 @@ def test_an_imu_that_is_left_out_is_named_while_vision_goes_on_alone() -> None:
     assert odometry.refuses_imu
 
 
-def test_a_start_from_rest_that_was_wrong_is_not_made_again_from_the_same_samples(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_wrong_start_from_rest_is_not_made_again_from_the_same_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """The image stands still and so does the IMU: the filter starts, is found wrong, and starts again by newer samples alone."""
-    begun_ns: list[int] = []
-    found = mono_modes.static_initialization
+    begun_ns, found = list[int](), mono_modes.static_initialization
 
-    def recorded(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
-        start = found(imu, until_ns, settings)
-        if start is not None:
-            begun_ns.append(int(imu.stamps_ns[0]))
+    def recorded(imu: ImuSamples, *about: Any) -> InitialState | None:
+        start = found(imu, *about)
+        begun_ns.extend([] if start is None else [int(imu.stamps_ns[0])])
         return start
 
     monkeypatch.setattr(mono_modes, "static_initialization", recorded)
