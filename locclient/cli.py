@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Option, echo
 
 from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, Options, Version, make_app
@@ -18,7 +18,7 @@ _MAX_BUNDLE_BYTES = 1 << 20
 
 
 def enrol(
-    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="ROBOT.fleetmap, from `mapserver robots enrol`.")],
+    bundle: Annotated[Path, Argument(metavar="BUNDLE", help="ROBOT.fleetmap, from `mapserver robots enrol`.")],
     identity: IdentityFolder = None,
 ) -> None:
     """Create this robot's key and obtain a certificate for it. `run`, `replay` and `check` then need neither `server` nor `root`."""
@@ -30,17 +30,17 @@ def enrol(
         raise UsageError(f"{bundle} has more than {_MAX_BUNDLE_BYTES} bytes and is not an enrolment bundle")
     made = RobotIdentity.enrol(identity_folder(identity), data)
     about = made.certificate()
-    typer.echo(f"enrolled as {made.who.robot} of site {made.who.site} at {made.who.endpoint}")
-    typer.echo(f"certificate {about.name} until {about.ends:%Y-%m-%d}, in {made.folder}")
-    typer.echo(f"{bundle} is used and no longer valid; remove it")
+    echo(f"enrolled as {made.who.robot} of site {made.who.site} at {made.who.endpoint}")
+    echo(f"certificate {about.name} until {about.ends:%Y-%m-%d}, in {made.folder}")
+    echo(f"{bundle} is used and no longer valid; remove it")
 
 
 def run(
-    context: typer.Context,
-    config: Annotated[Path, typer.Option(help="TOML file with the robot, its sensors, map and outputs.")],
+    context: Context,
+    config: Annotated[Path, Option(help="TOML file with the robot, its sensors, map and outputs.")],
     insecure: Insecure = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Log changes of status, versions, drops and deliveries too.")
+        bool, Option("--verbose", help="Log changes of status, versions, drops and deliveries too.")
     ] = False,
 ) -> None:
     """Localize a robot from its live sensors; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
@@ -60,20 +60,19 @@ def run(
         runtime = Runtime(parts, ServiceManager())
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: runtime.stop())
-        typer.echo(f"ready: {parts.profile.robot} at {parts.profile.site}, source {settings.source.kind}")
+        echo(f"ready: {parts.profile.robot} at {parts.profile.site}, source {settings.source.kind}")
         runtime.run()
 
 
 def status(
     folder: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="The daemon's $RUNTIME_DIRECTORY; default: ours, or /run/fleetmap."),
+        Path | None, Option(metavar="DIR", help="The daemon's $RUNTIME_DIRECTORY; default: ours, or /run/fleetmap.")
     ] = None,
 ) -> None:
     """Print the last status of the running daemon; exit status 3 if it is older than ten seconds."""
     from locclient.daemon.service_manager import last_status, runtime_folder
 
-    typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
+    echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
 
 
 COMMANDS: Commands = {"enrol": enrol, "replay": replay, "run": run, "status": status}

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Exit, Option, echo
 
 from fleetmap.cli_options import TopicNames, settings_of
 from fleetmap.errors import UsageError
@@ -17,12 +17,9 @@ if TYPE_CHECKING:
     from locclient.replay.replay import RunExport
     from locclient.replay.run_result import ReplayResult
 
-Insecure = Annotated[
-    bool, typer.Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")
-]
+Insecure = Annotated[bool, Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")]
 IdentityFolder = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="Folder that `locclient enrol` fills; default: in the user's state folder."),
+    Path | None, Option(metavar="DIR", help="Folder that `locclient enrol` fills; default: in the user's state folder.")
 ]
 NOT_LOCALISED_STATUS = 6
 
@@ -31,23 +28,22 @@ NOT_LOCALISED_STATUS = 6
 class MapOptions:
     """Options of the map and of the robot's name."""
 
-    server: Annotated[
-        str | None, typer.Option(help="zenoh endpoint of the map server; default: the robot's identity.")
-    ] = None
-    store: Annotated[Path | None, typer.Option(help="Folder of a map store, instead of a server.")] = None
-    site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
+    server: Annotated[str | None, Option(help="zenoh endpoint of the map server; default: the robot's identity.")] = (
+        None
+    )
+    store: Annotated[Path | None, Option(help="Folder of a map store, instead of a server.")] = None
+    site: Annotated[str | None, Option(help="Name of the site.")] = None
     robot: Annotated[
-        str | None, typer.Option(help="Name of the robot for the server; default: the identity's, or replay.")
+        str | None, Option(help="Name of the robot for the server; default: the identity's, or replay.")
     ] = None
-    cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
+    cache: Annotated[Path | None, Option(help="Folder of the tile cache; default: the user's cache.")] = None
     root: Annotated[
-        Path | None,
-        typer.Option(help="trust/1.root.json of the server's store; needed for a server on another machine."),
+        Path | None, Option(help="trust/1.root.json of the server's store; needed for a server on another machine.")
     ] = None
     identity: IdentityFolder = None
     insecure: Insecure = False
     # Equals tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
-    cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
+    cache_bytes: Annotated[int, Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
 
     def address(self, version: int | None) -> "MapAddress":
         """Return the map's address; UsageError unless the options name one map, and for a version with a server."""
@@ -60,19 +56,17 @@ class MapOptions:
 class PlaybackOptions:
     """Played frames of a recording, and playback options."""
 
-    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to play.")] = ":"
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file to use instead of the recording's own.")
-    ] = None
+    frames: Annotated[str, Option(metavar="A:B:C", help="Slice of the frames to play.")] = ":"
+    calibration: Annotated[Path | None, Option(help="Calibration file to use instead of the recording's own.")] = None
     topic: TopicNames = None
-    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
-    prior: Annotated[str | None, typer.Option(help="Start of the robot: X,Y,YAW,SIGMA_M (metres, radians).")] = None
-    reverse: Annotated[bool, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = False
+    use: Annotated[str | None, Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
+    prior: Annotated[str | None, Option(help="Start of the robot: X,Y,YAW,SIGMA_M (metres, radians).")] = None
+    reverse: Annotated[bool, Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = False
     realtime: Annotated[
-        bool, typer.Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
+        bool, Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
     ] = False
     starts: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Also start N times along the recording without any guess.")
+        int, Option(min=0, metavar="N", help="Also start N times along the recording without any guess.")
     ] = 0
 
 
@@ -80,13 +74,13 @@ class PlaybackOptions:
 class ResultFiles:
     """Files to write."""
 
-    report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
-    trajectory: Annotated[Path | None, typer.Option(help="Write the localized frames to this TUM file.")] = None
-    picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
+    report: Annotated[Path | None, Option(help="Write the report to this JSON file.")] = None
+    trajectory: Annotated[Path | None, Option(help="Write the localized frames to this TUM file.")] = None
+    picture: Annotated[Path | None, Option(help="Draw the run from above into this PNG file.")] = None
     protection_picture: Annotated[
-        Path | None, typer.Option(help="Draw errors and protection levels (Stanford diagram) into this PNG file.")
+        Path | None, Option(help="Draw errors and protection levels (Stanford diagram) into this PNG file.")
     ] = None
-    mcap: Annotated[Path | None, typer.Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
+    mcap: Annotated[Path | None, Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
 
     def write(self, result: "ReplayResult", report: dict[str, object]) -> None:
         """Write all but the MCAP file, which is written frame by frame."""
@@ -116,14 +110,13 @@ class ResultFiles:
 
 
 def replay(
-    context: typer.Context,
-    recording: Annotated[Path, typer.Argument(help="Folder (the parent of mav0 for EuRoC) or file.")],
+    context: Context,
+    recording: Annotated[Path, Argument(help="Folder (the parent of mav0 for EuRoC) or file.")],
     map_options: MapOptions,
     playback: PlaybackOptions,
     files: ResultFiles,
     version: Annotated[
-        int | None,
-        typer.Option(min=1, help="Version of the map in --store, drafts included; default: the current one."),
+        int | None, Option(min=1, help="Version of the map in --store, drafts included; default: the current one.")
     ] = None,
 ) -> None:
     """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: never localized.
@@ -167,12 +160,10 @@ def _replay_failure(
         answer = {"answer": found.answer, "version": found.version, "is_same": found.first_difference_ns is None}
         told = {"apart_m": found.apart_m, "then": summary.moments, "now": found.now}
         files.report.write_bytes(to_json(answer | told, indent=2) + b"\n")
-    typer.echo(
-        f"{summary.robot}, version {summary.version}, fleetmap {summary.client}; seconds since the failure began"
-    )
-    typer.echo(f"then: {', '.join(phases(summary.moments, summary.began_ns))}")
-    typer.echo(f"now:  {', '.join(phases(found.now, summary.began_ns))}")
-    typer.echo(found.answer)
+    echo(f"{summary.robot}, version {summary.version}, fleetmap {summary.client}; seconds since the failure began")
+    echo(f"then: {', '.join(phases(summary.moments, summary.began_ns))}")
+    echo(f"now:  {', '.join(phases(found.now, summary.began_ns))}")
+    echo(found.answer)
 
 
 def _run(
@@ -227,8 +218,8 @@ def _run(
         table.add_row(name, _shown(value))
     plain_console().print(table)
     if result.search.is_lost_run:
-        typer.echo(result.search.words, err=True)
-        raise typer.Exit(NOT_LOCALISED_STATUS)
+        echo(result.search.words, err=True)
+        raise Exit(NOT_LOCALISED_STATUS)
 
 
 def _shown(value: object) -> str:

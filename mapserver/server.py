@@ -14,9 +14,9 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 
-import typer
 import uvicorn
 from fastapi import FastAPI
+from typer import echo
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from fleetmap.bus.zenoh_bus import Bus
@@ -128,9 +128,9 @@ class Server:
 
     def _say_addresses(self) -> None:
         host, port = self.listener.getsockname()[:2]
-        typer.echo(f"http: {'https' if self.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
-        typer.echo(f"zenoh: {self.bus.endpoint}")
-        typer.echo("ready")
+        echo(f"http: {'https' if self.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
+        echo(f"zenoh: {self.bus.endpoint}")
+        echo("ready")
 
     def _http_config(self, served: ProxiedPeople) -> uvicorn.Config:
         config = uvicorn.Config(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Option, echo
 
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
@@ -18,34 +18,30 @@ class BuildCommandOptions(SurveyOptions):
     """Options of `build` beside those of `nightly`."""
 
     trajectory_out: Annotated[
-        Path | None, typer.Option(metavar="FILE.tum", help="Write the poses of all frames to this file.")
+        Path | None, Option(metavar="FILE.tum", help="Write the poses of all frames to this file.")
     ] = None
-    picture: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Draw the map from above into this file.")
-    ] = None
+    picture: Annotated[Path | None, Option(metavar="FILE.png", help="Draw the map from above into this file.")] = None
     frame_from_ground_truth: Annotated[
-        bool, typer.Option("--frame-from-ground-truth", help="Align the finished map with the ground truth.")
+        bool, Option("--frame-from-ground-truth", help="Align the finished map with the ground truth.")
     ] = False
-    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
+    use: Annotated[str | None, Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
     replay: Annotated[
         list[Path] | None,
-        typer.Option(metavar="RECORDING", help="Earlier recording of the current version to localize in the draft."),
+        Option(metavar="RECORDING", help="Earlier recording of the current version to localize in the draft."),
     ] = None
 
 
 def build(
-    context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
+    context: Context,
+    recordings: Annotated[list[Path], Argument(metavar="RECORDING...", help="Folder or file to survey.")],
     options: BuildCommandOptions,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system as the start.")
+        Path | None, Option(metavar="FILE", help="Poses of another SLAM system as the start.")
     ] = None,
     trajectory_frame: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
+        str | None, Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
     ] = None,
-    trajectory_scale: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
-    ] = None,
+    trajectory_scale: Annotated[float | None, Option(metavar="METRES", help="Metres in their unit of length.")] = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     check_output("--trajectory-out", options.trajectory_out)
@@ -71,7 +67,7 @@ def build(
             frame_from_ground_truth=options.frame_from_ground_truth,
         ),
     )
-    typer.echo(built.sentence)
+    echo(built.sentence)
 
 
 def _other_trajectory(file: Path | None, frame: str | None, scale: float | None) -> "StartPoses | None":

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option, echo
 
 from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError, disk_errors
@@ -18,31 +18,28 @@ if TYPE_CHECKING:
     from mapserver.floor_plan.rmf import RmfLevel
     from mapserver.store import MapStore
 
-_Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the building.")]
+_Name = Annotated[str, Argument(metavar="NAME", help="Name of the building.")]
 _FORM, _RMF_FORM = "SITE=LEVEL@HEIGHT", "SITE=LEVEL"
 
 
 def align(
     *,
     where: options.SiteOptions,
-    plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
-    ] = None,
+    plan: Annotated[Path | None, Option(metavar="FILE", help="Drawing of the building from above, a picture.")] = None,
     pin: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
+        Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: estimated from the pins.")
+        float | None, Option(min=1e-6, max=1e3, help="Scale of the plan; default: estimated from the pins.")
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Print the stored alignment; change nothing.")] = False,
+    show: Annotated[bool, Option("--show", help="Print the stored alignment; change nothing.")] = False,
     level: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Name of the level for Open-RMF; default: the building's, else L1."),
+        str | None, Option(metavar="NAME", help="Name of the level for Open-RMF; default: the building's, else L1.")
     ] = None,
     json: options.Json = False,
     by: options.ActorOptions,
-    forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
+    forget: Annotated[bool, Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
     """Estimate the pose of the map in the building's drawing, and store it; robots get it with the signed list."""
     from mapserver.fleet import building
@@ -56,16 +53,16 @@ def align(
         corners = building.current_corners_m(maps, where.site)
         if forget:
             building.forget_alignment(maps, where.site, by.named())
-            typer.echo(f"site {where.site}: the alignment is forgotten; robots use the alignment of their version")
+            echo(f"site {where.site}: the alignment is forgotten; robots use the alignment of their version")
             return
         if named:
             pins, drawing = [parse_pin(text) for text in pin or []], None if plan is None else read_plan(plan)
             fit = building.align(maps, where.site, pins, drawing, metres_per_pixel, by.named())
             if not fit.is_checked:
                 words = "the pins lie on one line and cannot reveal a mirrored plan; add a pin beside the line"
-                typer.echo(f"note: {words}", err=True)
+                echo(f"note: {words}", err=True)
             off_m = 2 * fit.far_sigma_m
-            typer.echo(f"at the far end of the map positions in the building are known to {off_m:.2f} m (95 %)")
+            echo(f"at the far end of the map positions in the building are known to {off_m:.2f} m (95 %)")
         alignment, tower = maps.alignment(where.site), maps.building(where.site)
     if level is None:
         levels = {} if tower is None else {floor.site: floor.level for floor in tower.floors}
@@ -89,7 +86,7 @@ def _alignment_words(found: "Alignment", corners: "Array", level: str) -> Iterat
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON of polygons, in metres.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="GeoJSON of polygons, in metres.")],
     where: options.SiteOptions,
     by: options.ActorOptions,
 ) -> None:
@@ -103,7 +100,7 @@ def import_(
         raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
     with options.open_store(where.store) as maps:
         names = keep_areas(maps, where.site, data, f"areas of {file.name}", by.named()).names
-    typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
+    echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
 
 
 def remove_areas(where: options.SiteOptions, by: options.ActorOptions) -> None:
@@ -112,7 +109,7 @@ def remove_areas(where: options.SiteOptions, by: options.ActorOptions) -> None:
 
     with options.open_store(where.store) as maps:
         keep_areas(maps, where.site, None, "no areas", by.named())
-    typer.echo(f"site {where.site} has no areas")
+    echo(f"site {where.site} has no areas")
 
 
 def list_areas(where: options.SiteOptions, json: options.Json = False) -> None:
@@ -128,10 +125,10 @@ def list_areas(where: options.SiteOptions, json: options.Json = False) -> None:
 def export(
     where: options.SiteOptions,
     keep_out: Annotated[
-        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's KeepoutFilter, and its image.")
+        Path | None, Option(metavar="OUT.yaml", help="Write the mask of nav2's KeepoutFilter, and its image.")
     ] = None,
     speed: Annotated[
-        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's SpeedFilter, and its image.")
+        Path | None, Option(metavar="OUT.yaml", help="Write the mask of nav2's SpeedFilter, and its image.")
     ] = None,
 ) -> None:
     """Write the areas with a mask for nav2's costmap filters, in the frame of the map."""
@@ -150,7 +147,7 @@ def export(
     grids = {file: mask_grid(areas, kind) for kind, file in asked.items() if file is not None}
     for file, grid in grids.items():
         write_grid(file, grid)
-        typer.echo(str(file))
+        echo(str(file))
 
 
 AREAS = Group(
@@ -159,12 +156,11 @@ AREAS = Group(
 
 
 def set_(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the building; default: the file's.")] = "",
+    name: Annotated[str, Argument(metavar="NAME", help="Name of the building; default: the file's.")] = "",
     *,
-    floor: Annotated[list[str], typer.Option(metavar=_FORM, help="A floor: site, its level's name, height in metres.")],
+    floor: Annotated[list[str], Option(metavar=_FORM, help="A floor: site, its level's name, height in metres.")],
     file: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Take heights and lifts from a *.building.yaml of Open-RMF."),
+        Path | None, Option("--from", metavar="FILE", help="Take heights and lifts from a *.building.yaml of Open-RMF.")
     ] = None,
     store: options.StoreFolder,
     by: options.ActorOptions,
@@ -183,7 +179,7 @@ def set_(
         options.print_result(kept, _building_words(maps, kept))
     if lifts:
         words = "areas with the same `lift` on the other floors are missing"
-        typer.echo(f"note: {', '.join(lifts)}: {words}", err=True)
+        echo(f"note: {', '.join(lifts)}: {words}", err=True)
 
 
 def remove_building(name: _Name, *, store: options.StoreFolder, by: options.ActorOptions) -> None:
@@ -192,7 +188,7 @@ def remove_building(name: _Name, *, store: options.StoreFolder, by: options.Acto
 
     with options.open_store(store) as maps:
         removed = building.remove_building(maps, name, by.named())
-    typer.echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
+    echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
 
 
 def list_buildings(
@@ -200,7 +196,7 @@ def list_buildings(
     store: options.StoreFolder,
     json: options.Json = False,
     form: Annotated[
-        Literal["rmf"] | None, typer.Option("--as", metavar="rmf", help="Print a *.building.yaml of Open-RMF.")
+        Literal["rmf"] | None, Option("--as", metavar="rmf", help="Print a *.building.yaml of Open-RMF.")
     ] = None,
 ) -> None:
     """List the buildings with their floors and lifts."""
@@ -210,7 +206,7 @@ def list_buildings(
     with options.open_store(store, read_only=True) as maps:
         found = buildings(maps)
         if form == "rmf" and not json:
-            typer.echo("---\n".join(rmf_text(building, floors_of(maps, building)) for building in found), nl=False)
+            echo("---\n".join(rmf_text(building, floors_of(maps, building)) for building in found), nl=False)
             return
         lines = [line for building in found for line in _building_words(maps, building)]
     options.print_result(found, [*lines, f"buildings: {len(found)}"], json=json)

@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Context, Exit, Option, echo
 
 from fleetmap.cli_options import Group, settings_of
 from fleetmap.errors import UsageError
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def report(
-    context: typer.Context,
-    out: Annotated[Path, typer.Argument(metavar="OUT.html", help="File to write; replaced if it exists.")],
+    context: Context,
+    out: Annotated[Path, Argument(metavar="OUT.html", help="File to write; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
-    hours: Annotated[int, typer.Option(min=1, max=9600, help="Hours to look back.")] = 24,
+    hours: Annotated[int, Option(min=1, max=9600, help="Hours to look back.")] = 24,
 ) -> None:
     """Write a one-page report for the shift leader: failures per robot-day, worst robots, versions, causes, tiles to resurvey."""
     from mapserver.dashboard.shift_page import html_page
@@ -30,17 +30,17 @@ def report(
     with open_store(store, read_only=True) as maps:
         page = html_page(maps, site, hours, time.time_ns(), settings_of(context))
     write_output(out, page.encode())
-    typer.echo(str(out))
+    echo(str(out))
 
 
 def export(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write; replaced if it exists.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="File to write; replaced if it exists.")],
     store: StoreFolder,
-    site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
-    hours: Annotated[int | None, typer.Option(min=1, help="Only the last N hours; default: everything.")] = None,
+    site: Annotated[str | None, Option(help="Name of the site; default: all sites.")] = None,
+    hours: Annotated[int | None, Option(min=1, help="Only the last N hours; default: everything.")] = None,
     format_: Annotated[
         Literal["jsonl", "mcap", "verdicts"] | None,
-        typer.Option("--format", help="jsonl, verdicts (jsonl with them) or mcap; default: by the file's name."),
+        Option("--format", help="jsonl, verdicts (jsonl with them) or mcap; default: by the file's name."),
     ] = None,
 ) -> None:
     """Write failures as JSON lines, or as MCAP with log, positions and pictures for Foxglove."""
@@ -58,15 +58,15 @@ def export(
         is_plain = chosen == "jsonl"
         write = write_json_lines if is_plain else plugin("mapserver.failure_exports", chosen, f"--format {chosen}")
         count = write(maps, FailureFilter(site=site, since_ns=since_ns), out)
-    typer.echo(f"{count} failures")
+    echo(f"{count} failures")
 
 
 def resurvey(
-    context: typer.Context,
+    context: Context,
     site: SiteName,
     store: StoreFolder,
     route: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the route: .csv, or GeoJSON for any other name.")
+        Path | None, Option(metavar="FILE", help="Write the route: .csv, or GeoJSON for any other name.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -96,10 +96,10 @@ def _words(found: "ResurveyList") -> Iterator[str]:
 
 
 def replay(
-    failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
+    failure: Annotated[int, Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
     store: StoreFolder,
     version: Annotated[
-        int | None, typer.Option(metavar="N", help="Version of the map to try; default: the robot's then.")
+        int | None, Option(metavar="N", help="Version of the map to try; default: the robot's then.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -117,16 +117,16 @@ def replay(
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
         output = report.read_text("utf-8") if json and report.exists() else done.stdout
     if not without_network():
-        typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
+        echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
     for text, is_error in ((done.stderr, True), (output, False)):
         for line in text.splitlines():
-            typer.echo(line if json and not is_error else printable(line), err=is_error)
+            echo(line if json and not is_error else printable(line), err=is_error)
     if done.returncode:
-        raise typer.Exit(done.returncode)
+        raise Exit(done.returncode)
 
 
 def remove(
-    failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
+    failure: Annotated[int, Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
     store: StoreFolder,
     by: ActorOptions,
 ) -> None:
@@ -135,7 +135,7 @@ def remove(
         row = maps.fleet.failure(failure).failure
         maps.fleet.remove_failure(failure)
         maps.audit("failure removed", f"{failure} of {row.robot}", actor=by.named(), site=row.site)
-    typer.echo(f"failure {failure} of {row.robot} is removed")
+    echo(f"failure {failure} of {row.robot} is removed")
 
 
 FLEET = Group(

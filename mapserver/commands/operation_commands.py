@@ -3,7 +3,7 @@
 from inspect import Parameter, Signature, signature
 from typing import Any
 
-import typer
+from typer import Context, echo
 
 from fleetmap.cli_options import Command, Commands, Group, settings_of
 from mapserver.api.operations import OPERATIONS, Caller, Operation
@@ -25,10 +25,10 @@ def with_operations(commands: Commands) -> Commands:
 def _command(operation: Operation) -> Command:
     """The command of an operation: its own parameters, the store, and who acts."""
 
-    def run(*, context: typer.Context, store: StoreFolder, by: ActorOptions, **own: Any) -> None:
+    def run(*, context: Context, store: StoreFolder, by: ActorOptions, **own: Any) -> None:
         with open_store(store) as maps:
             done = operation.run(Caller(maps, by.named(), settings_of(context)), **own)
-        typer.echo(done.words)
+        echo(done.words)
 
     (*general, _) = signature(run).parameters.values()
     own = [item.replace(kind=Parameter.KEYWORD_ONLY) for item in operation.parameters.values()]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Context, Option, echo
 
 from fleetmap.cli_options import TopicNames, config_path, settings_of
 from fleetmap.errors import UsageError, disk_errors
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from mapserver.store import Actor, MapStore
 
 
-SiteName = Annotated[str, typer.Option(help="Name of the site.")]
-StoreFolder = Annotated[Path, typer.Option(help="Folder of the map store.")]
-NewStoreFolder = Annotated[Path, typer.Option(help="Folder of the map store; created if it does not exist.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-Calibration = Annotated[Path | None, typer.Option(metavar="FILE", help="Kalibr camchain to use.")]
+SiteName = Annotated[str, Option(help="Name of the site.")]
+StoreFolder = Annotated[Path, Option(help="Folder of the map store.")]
+NewStoreFolder = Annotated[Path, Option(help="Folder of the map store; created if it does not exist.")]
+Json = Annotated[bool, Option("--json", help="Print JSON instead of text.")]
+Calibration = Annotated[Path | None, Option(metavar="FILE", help="Kalibr camchain to use.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +42,8 @@ class SiteOptions:
 class ActorOptions:
     """The person who changes a store, and the reason; both go into its log."""
 
-    actor: Annotated[str | None, typer.Option(metavar="NAME", help="Who acts; default: the user's name.")] = None
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the log.")] = ""
+    actor: Annotated[str | None, Option(metavar="NAME", help="Who acts; default: the user's name.")] = None
+    reason: Annotated[str, Option(metavar="TEXT", help="Why; kept in the log.")] = ""
 
     def named(self) -> "Actor":
         """The actor for the store's log."""
@@ -63,19 +63,15 @@ class SurveyOptions(SiteOptions):
     """Options of `build` and `nightly`."""
 
     store: NewStoreFolder
-    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to use.")] = "::"
+    frames: Annotated[str, Option(metavar="A:B:C", help="Slice of the frames to use.")] = "::"
     calibration: Calibration = None
     topic: TopicNames = None
-    zones: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="TOML file of areas without sight of each other.")
-    ] = None
-    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report to this file.")] = None
-    threads: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: one per core.")] = None
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...).")] = (
-        None
-    )
+    zones: Annotated[Path | None, Option(metavar="FILE", help="TOML file of areas without sight of each other.")] = None
+    report: Annotated[Path | None, Option(metavar="FILE", help="Write the JSON report to this file.")] = None
+    threads: Annotated[int | None, Option(min=1, help="Number of threads; default: one per core.")] = None
+    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...).")] = None
 
-    def build_options(self, context: typer.Context, **more: Any) -> "BuildOptions":
+    def build_options(self, context: Context, **more: Any) -> "BuildOptions":
         """Return the options of a build, with additions."""
         from mapserver import BuildOptions
 
@@ -92,7 +88,7 @@ class SurveyOptions(SiteOptions):
         check_name(self.site, "site")
 
 
-def topics_of(context: typer.Context, words: list[str] | None) -> "Topics":
+def topics_of(context: Context, words: list[str] | None) -> "Topics":
     """Return the [topics] of the configuration file, overridden by those of --topic."""
     from fleetmap.recordings import named_topics
 
@@ -137,11 +133,11 @@ def print_result(value: object, parts: "Iterable[str | Table | Text]", *, json: 
     from fleetmap.encoding import to_json
 
     if json:
-        typer.echo(to_json(value, indent=2).decode())
+        echo(to_json(value, indent=2).decode())
         return
     for part in parts:
         if isinstance(part, str):
-            typer.echo("\n".join(map(printable, part.split("\n"))))  # strangers chose some of the words
+            echo("\n".join(map(printable, part.split("\n"))))  # strangers chose some of the words
         else:
             plain_console().print(part)
 

@@ -3,13 +3,13 @@
 from datetime import UTC, datetime
 from typing import Annotated
 
-import typer
+from typer import Context, Option
 
 from fleetmap.cli_options import Group, settings_of
 from mapserver.api.operations.incidents import InboxFolder
 from mapserver.commands.options import Json, StoreFolder, open_store, print_result, table
 
-Site = Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")]
+Site = Annotated[str | None, Option(help="Name of the site; default: all sites.")]
 
 
 def list_robots(store: StoreFolder, site: Site = None, json: Json = False) -> None:
@@ -37,11 +37,7 @@ def list_operators(store: StoreFolder, json: Json = False) -> None:
 
 
 def list_incidents(
-    context: typer.Context,
-    store: StoreFolder,
-    site: Site = None,
-    inbox: InboxFolder = None,
-    json: Json = False,
+    context: Context, store: StoreFolder, site: Site = None, inbox: InboxFolder = None, json: Json = False
 ) -> None:
     """List alerts, refused drafts, recordings that are held or bad, and failures in work, with their state and who has them."""
     from mapserver.api.incidents import incidents

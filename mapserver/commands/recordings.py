@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Exit, Option, echo
 
 from fleetmap.cli_options import TopicNames
 from fleetmap.errors import UsageError
@@ -17,13 +17,12 @@ _STDOUT = Path("-")
 
 
 def doctor(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or file to check.")],
+    recording: Annotated[Path, Argument(metavar="RECORDING", help="Folder or file to check.")],
     json_file: Annotated[
-        Path | None,
-        typer.Option("--json", metavar="FILE", help="Write the findings here as JSON too; - prints JSON alone."),
+        Path | None, Option("--json", metavar="FILE", help="Write the findings here as JSON too; - prints JSON alone.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to check against.")
+        Path | None, Option("--calibration", metavar="FILE", help="Kalibr camchain to check against.")
     ] = None,
     topic: TopicNames = None,
 ) -> None:
@@ -48,11 +47,11 @@ def doctor(
         if json_file != _STDOUT:
             _print(source, findings)
         if json_file == _STDOUT:
-            typer.echo(_as_json(source, findings), nl=False)
+            echo(_as_json(source, findings), nl=False)
         elif json_file is not None:
             json_file.write_text(_as_json(source, findings), encoding="utf-8")
     if worst(findings) is Verdict.FAIL:
-        raise typer.Exit(EXIT_STATUS_BAD_RECORDING)
+        raise Exit(EXIT_STATUS_BAD_RECORDING)
 
 
 def _print(source: "Recording", findings: "list[Finding]") -> None:
@@ -98,13 +97,13 @@ def _as_json(source: "Recording", findings: "list[Finding]") -> str:
 
 
 def convert(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or file to read.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="MCAP file to write.")],
+    recording: Annotated[Path, Argument(metavar="RECORDING", help="Folder or file to read.")],
+    out: Annotated[Path, Argument(metavar="OUT.mcap", help="MCAP file to write.")],
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", metavar="FILE", help="Kalibr camchain to use and to store.")
+        Path | None, Option("--calibration", metavar="FILE", help="Kalibr camchain to use and to store.")
     ] = None,
     topic: TopicNames = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT.mcap if it exists.")] = False,
+    force: Annotated[bool, Option("--force", help="Replace OUT.mcap if it exists.")] = False,
 ) -> None:
     """Write RECORDING as an MCAP file in the style of rosbag2, images as they were encoded."""
     if out.suffix != ".mcap":

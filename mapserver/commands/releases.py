@@ -5,7 +5,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from fleetmap.errors import UsageError
 from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_result, table
@@ -33,9 +33,7 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
 def inspect(
     site: SiteName,
     store: StoreFolder,
-    version: Annotated[
-        int | None, typer.Option(min=1, help="Version; default: the current one, else the newest.")
-    ] = None,
+    version: Annotated[int | None, Option(min=1, help="Version; default: the current one, else the newest.")] = None,
     json: Json = False,
 ) -> None:
     """Show a version: sizes, recordings and their findings, gate results, history. --json has the whole manifest."""
@@ -105,8 +103,8 @@ def _moment(stamp_ns: int) -> str:
 
 
 def diff(
-    before: Annotated[int, typer.Argument(min=1, metavar="A", help="The older version.")],
-    after: Annotated[int, typer.Argument(min=1, metavar="B", help="The newer version.")],
+    before: Annotated[int, Argument(min=1, metavar="A", help="The older version.")],
+    after: Annotated[int, Argument(min=1, metavar="B", help="The newer version.")],
     site: SiteName,
     store: StoreFolder,
     json: Json = False,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Context, Option, echo
 
 from fleetmap.cli_options import config_path, settings_of
 from fleetmap.errors import UsageError, disk_errors
@@ -27,23 +27,22 @@ _NO_TLS = "This server was started with --insecure. Passwords and sessions are s
 class HttpOptions:
     """HTTP address and host names of the server."""
 
-    http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
+    http: Annotated[str, Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
     http_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="PEM certificate for HTTPS; reloaded when it is renewed.")
+        Path | None, Option(metavar="FILE", help="PEM certificate for HTTPS; reloaded when it is renewed.")
     ] = None
-    http_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM key of --http-cert.")] = None
+    http_key: Annotated[Path | None, Option(metavar="FILE", help="PEM key of --http-cert.")] = None
     http_name: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Host name that a proxy passes on; repeat it.")
+        list[str] | None, Option(metavar="NAME", help="Host name that a proxy passes on; repeat it.")
     ] = None
     sign_in_proxy: Annotated[
-        list[str] | None, typer.Option(metavar="ADDRESS", help="Address of a proxy that signs users in; repeat it.")
+        list[str] | None, Option(metavar="ADDRESS", help="Address of a proxy that signs users in; repeat it.")
     ] = None
     sign_in_group: Annotated[
-        list[str] | None, typer.Option(metavar="GROUP=ROLE", help="Role of a group that the proxy names; repeat it.")
+        list[str] | None, Option(metavar="GROUP=ROLE", help="Role of a group that the proxy names; repeat it.")
     ] = None
     insecure: Annotated[
-        bool,
-        typer.Option("--insecure", help="Serve other machines without TLS and operators, and say so on every page."),
+        bool, Option("--insecure", help="Serve other machines without TLS and operators, and say so on every page.")
     ] = False
 
     def host_and_port(self) -> tuple[str, int]:
@@ -101,17 +100,16 @@ class HttpOptions:
 
 
 def serve(
-    context: typer.Context,
+    context: Context,
     store: StoreFolder,
     at: HttpOptions,
     zenoh: Annotated[
-        str,
-        typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
+        str, Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`.")
     ] = "tcp/127.0.0.1:7447",
-    create: Annotated[bool, typer.Option("--create", help="Make the store if the folder holds none.")] = False,
+    create: Annotated[bool, Option("--create", help="Make the store if the folder holds none.")] = False,
     inbox: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="DIR",
             help="Folder of inboxes, DIR/SITE, for uploads and builds of operators; created if it does not exist.",
         ),
@@ -122,7 +120,7 @@ def serve(
 
     raise_file_limit()
     host, port = at.host_and_port()
-    typer.echo(f"mapserver serve is starting with the store {store}; `ready` follows", err=True)
+    echo(f"mapserver serve is starting with the store {store}; `ready` follows", err=True)
     from fleetmap.bus.endpoints import check_endpoint
     from mapserver.server import Server, end_process, listening
     from mapserver.serving.bus_access import check_binding, prepare_bus

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Exit, Option, echo
 
 from fleetmap.cli_options import settings_of
 from fleetmap.errors import BusyError, StoreError, UsageError
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mapserver.store.upkeep import Garbage, StoreFindings
 
 EXIT_STATUS_FAULTS = 3
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")]
+DryRun = Annotated[bool, Option("--dry-run", help="Print what would be removed; remove nothing.")]
 
 
 def verify(store: options.StoreFolder, json: options.Json = False) -> None:
@@ -27,7 +27,7 @@ def verify(store: options.StoreFolder, json: options.Json = False) -> None:
         found = maps.verify()
     options.print_result(found, _findings(store, found), json=json)
     if found.faults:
-        raise typer.Exit(EXIT_STATUS_FAULTS)
+        raise Exit(EXIT_STATUS_FAULTS)
 
 
 def _findings(store: Path, found: "StoreFindings") -> Iterator[str]:
@@ -43,11 +43,11 @@ def _findings(store: Path, found: "StoreFindings") -> Iterator[str]:
 def gc(
     *,
     store: options.StoreFolder,
-    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5,
-    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3,
-    keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0,
+    keep_versions: Annotated[int, Option(min=0, help="Published versions of a site to keep.")] = 5,
+    keep_drafts: Annotated[int, Option(min=0, help="Drafts of a site to keep.")] = 3,
+    keep_days: Annotated[float, Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0,
     robot_days: Annotated[
-        float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
+        float, Option(min=0, help="Days for which a silent robot still counts as using its version.")
     ] = 30.0,
     by: options.ActorOptions,
     dry_run: DryRun = False,
@@ -87,11 +87,11 @@ def gc(
 
 
 def retention(
-    context: typer.Context,
+    context: Context,
     *,
     store: options.StoreFolder,
     inbox: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
+        Path | None, Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
     ] = None,
     dry_run: DryRun = False,
     json: options.Json = False,
@@ -108,7 +108,7 @@ def retention(
         free = [each for each in inboxes if not is_name(each.name) or _is_free(maps, each.name, locks)]
         removed = apply_retention(maps, settings_of(context).ingest.retention(), free, dry_run=dry_run)
     for each in sorted({*inboxes} - {*free}):
-        typer.echo(f"{each}: a night reads its recordings; it removed what was old at its start", err=True)
+        echo(f"{each}: a night reads its recordings; it removed what was old at its start", err=True)
     would = "would be " if dry_run else ""
     options.print_result(removed, (f"{name}: {count} {would}removed" for name, count in removed.items()), json=json)
 
@@ -125,12 +125,12 @@ def _is_free(maps: "MapStore", site: str, locks: ExitStack) -> bool:
 
 
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced if it exists.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="File to write; replaced if it exists.")],
     site: options.SiteName,
     store: options.StoreFolder,
-    version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
+    version: Annotated[int | None, Option(min=1, help="Version; default: the current one.")] = None,
     without_archive: Annotated[
-        bool, typer.Option("--without-archive", help="Leave out data needed only by later surveys.")
+        bool, Option("--without-archive", help="Leave out data needed only by later surveys.")
     ] = False,
 ) -> None:
     """Write a version into FILE; `mapserver import` reads it into another store."""
@@ -138,27 +138,27 @@ def export(
     with options.open_store(store, read_only=True) as maps:
         version = options.version_named(maps, site, version)
         size = maps.export_version(site, version, file, archive=not without_archive)
-    typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
+    echo(f"site {site}: version {version} is in {file} ({size} bytes)")
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File written by `mapserver export`.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="File written by `mapserver export`.")],
     store: options.NewStoreFolder,
     by: options.ActorOptions,
 ) -> None:
     """Import the version in FILE into a store, as a draft of its site with the same number."""
     with options.open_store(store, create=True) as maps:
         info = maps.import_version(file, actor=by.named())
-    typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")
+    echo(f"site {info.site}: version {info.version} is in the store ({info.state})")
 
 
 def audit(
     store: options.StoreFolder,
-    verify: Annotated[bool, typer.Option("--verify", help="Check the hash chain; status 3 for a fault.")] = False,
-    last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
-    person: Annotated[str | None, typer.Option(metavar="NAME", help="Only what this person did.")] = None,
-    site: Annotated[str | None, typer.Option(help="Only what was done to this site.")] = None,
-    kind: Annotated[str | None, typer.Option(metavar="KIND", help="Only kinds that begin so.")] = None,
+    verify: Annotated[bool, Option("--verify", help="Check the hash chain; status 3 for a fault.")] = False,
+    last: Annotated[int, Option(min=1, help="Number of lines to print.")] = 50,
+    person: Annotated[str | None, Option(metavar="NAME", help="Only what this person did.")] = None,
+    site: Annotated[str | None, Option(help="Only what was done to this site.")] = None,
+    kind: Annotated[str | None, Option(metavar="KIND", help="Only kinds that begin so.")] = None,
     json: options.Json = False,
 ) -> None:
     """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
@@ -174,7 +174,7 @@ def audit(
     told = [*(f"fault: {fault}" for fault in faults), summary]
     options.print_result({"lines": len(lines), "faults": faults}, told, json=json)
     if faults:
-        raise typer.Exit(EXIT_STATUS_FAULTS)
+        raise Exit(EXIT_STATUS_FAULTS)
 
 
 def _words(line: "AuditLine") -> str:
@@ -189,12 +189,8 @@ def _words(line: "AuditLine") -> str:
 
 def attach(
     store: options.NewStoreFolder,
-    content: Annotated[
-        str | None, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")
-    ] = None,
-    database: Annotated[
-        str | None, typer.Option(metavar="URL", help="PostgreSQL database for everything else.")
-    ] = None,
+    content: Annotated[str | None, Option(metavar="URL", help="Object store for tiles, archives and pictures.")] = None,
+    database: Annotated[str | None, Option(metavar="URL", help="PostgreSQL database for everything else.")] = None,
 ) -> None:
     """Move a store out of its folder, or let a new folder share one that was moved; stop the server and the nights first."""
     from mapserver.store import MapStore
@@ -204,6 +200,6 @@ def attach(
         raise UsageError("name --content, --database or both")
     with options.shown_progress("blobs") as progress:
         copied = MapStore.attach(store, Places(content, database), progress)
-    typer.echo(
+    echo(
         f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"
     )

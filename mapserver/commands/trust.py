@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Exit, Option, echo
 
 from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError
@@ -18,23 +18,21 @@ if TYPE_CHECKING:
 
 KeyFile = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE", help="Root key; its passphrase is asked for; default: root.pem in keys/ of the store."
-    ),
+    Option(metavar="FILE", help="Root key; its passphrase is asked for; default: root.pem in keys/ of the store."),
 ]
 Hosts = Annotated[
-    list[str] | None, typer.Option(metavar="NAME", help="Name or address of this machine for robots; repeat it.")
+    list[str] | None, Option(metavar="NAME", help="Name or address of this machine for robots; repeat it.")
 ]
 Rotated = Literal["online", "root", "server", "robots-ca"]
-SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]
+SiteArgument = Annotated[str, Argument(metavar="SITE", help="Name of the site.")]
 
 
 def init(
     store: StoreFolder,
-    here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
+    here: Annotated[bool, Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
     stick: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR", help="Folder for the root key, such as a USB stick; no copy stays here."),
+        Option(metavar="DIR", help="Folder for the root key, such as a USB stick; no copy stays here."),
     ] = None,
     host: Hosts = None,
 ) -> None:
@@ -64,8 +62,8 @@ def init(
         made += [(path, words)] if path is not None and words is not None else []
     for file, passphrase in made:
         _show(file, passphrase)
-    typer.echo(f"robots reach the server by the name {', '.join(hosts)}; --host names others")
-    typer.echo(f"serve with --zenoh tls/0.0.0.0:7447; `mapserver robots enrol ROBOT --site SITE --store {store}`")
+    echo(f"robots reach the server by the name {', '.join(hosts)}; --host names others")
+    echo(f"serve with --zenoh tls/0.0.0.0:7447; `mapserver robots enrol ROBOT --site SITE --store {store}`")
 
 
 def admit(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
@@ -74,13 +72,13 @@ def admit(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
 
     with open_store(store) as maps:
         admit_site(maps, site, _root_key(maps, key))
-    typer.echo(f"site {site}: its lists are signed by this server's new key")
+    echo(f"site {site}: its lists are signed by this server's new key")
 
 
 def rotate(
     what: Annotated[
         Rotated,
-        typer.Argument(
+        Argument(
             help="online: the key of the lists; root: root and targets, for two and one more years; server: its certificate; "
             "robots-ca: the authority that signs robots."
         ),
@@ -88,11 +86,11 @@ def rotate(
     store: StoreFolder,
     key: KeyFile = None,
     stick: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="For root: folder of a new root key that replaces this one.")
+        Path | None, Option(metavar="DIR", help="For root: folder of a new root key that replaces this one.")
     ] = None,
     host: Hosts = None,
     stolen: Annotated[
-        bool, typer.Option("--stolen", help="For robots-ca: invalidate all that it signed; all robots enrol again.")
+        bool, Option("--stolen", help="For robots-ca: invalidate all that it signed; all robots enrol again.")
     ] = False,
 ) -> None:
     """Replace keys, or sign root and targets again before they expire."""
@@ -111,7 +109,7 @@ def rotate(
             signing.rotate_online(maps, root_key)
         elif made := signing.rotate_root(maps, root_key, stick):
             _show(*made)
-    typer.echo("done; robots follow with their next query")
+    echo("done; robots follow with their next query")
 
 
 def _rotate_certificates(
@@ -123,13 +121,13 @@ def _rotate_certificates(
     _ = register.tls  # raises if there is nothing to rotate
     if what == "server":
         register.authorities.rotate_server(key, None if key is None else _passphrase(key), hosts)
-        typer.echo("done; a running server loads it within two seconds")
+        echo("done; a running server loads it within two seconds")
         return
     register.authorities.rotate_robots_ca(is_stolen=is_stolen)
     if is_stolen:
-        typer.echo(f"done; {register.revoke_all()} robots must be enrolled again")
+        echo(f"done; {register.revoke_all()} robots must be enrolled again")
     else:
-        typer.echo("done; robots follow when they renew their certificates, within a month")
+        echo("done; robots follow when they renew their certificates, within a month")
 
 
 def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
@@ -138,7 +136,7 @@ def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
 
     with open_store(store) as maps:
         revoke_site(maps, site, _root_key(maps, key))
-    typer.echo(f"site {site}: the old keys are revoked; robots follow with their next query")
+    echo(f"site {site}: the old keys are revoked; robots follow with their next query")
 
 
 def status(store: StoreFolder, json: Json = False) -> None:
@@ -153,12 +151,11 @@ def status(store: StoreFolder, json: Json = False) -> None:
     told = [*(Text(risk, "yellow") for risk in found.risks), *(Text(fault, "red") for fault in found.faults)]
     print_result(found, [table(("role", "number", "days left", ""), rows), *told], json=json)
     if found.faults:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a report, with its signature.")],
-    store: StoreFolder,
+    folder: Annotated[Path, Argument(metavar="DIR", help="Folder of a report, with its signature.")], store: StoreFolder
 ) -> None:
     """Check that a report was signed by this store and is unchanged; status 3 otherwise."""
     from fleetmap.errors import disk_errors
@@ -169,7 +166,7 @@ def verify(
         signature = signed.read_bytes()
         files = {path.name: path.read_bytes() for path in folder.glob(f"{signed.stem}.*") if path != signed}
     with open_store(store, read_only=True) as maps:
-        typer.echo(f"signed on {verify_files(maps, signature, files)} by this store, and unchanged")
+        echo(f"signed on {verify_files(maps, signature, files)} by this store, and unchanged")
 
 
 def _root_key(maps: "MapStore", path: Path | None) -> "Signer":
@@ -189,7 +186,7 @@ def _passphrase(path: Path) -> str:
 
 
 def _show(path: Path, passphrase: str) -> None:
-    typer.echo(f"{path}: {passphrase}   (shown once: write it down and keep it apart from the key)")
+    echo(f"{path}: {passphrase}   (shown once: write it down and keep it apart from the key)")
 
 
 TRUST = Group(

@@ -4,14 +4,13 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, Typer, echo
 
 from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Version
 from fleetmap.errors import UsageError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False)
-Option = typer.Option
+app = Typer(no_args_is_help=True, add_completion=False)
 
 
 @app.callback()
@@ -26,12 +25,12 @@ def scenarios() -> None:
 
     for name, make in SCENARIOS.items():
         scenario = make()
-        typer.echo(f"{name}  [{' '.join(scenario.runs)}]  {scenario.description}")
+        echo(f"{name}  [{' '.join(scenario.runs)}]  {scenario.description}")
 
 
 @app.command()
 def record(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")],
+    scenario: Annotated[str, Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")],
     out: Annotated[Path, Option(help="File to write (.mcap).")],
     seed: Annotated[int, Option(help="Seed of all randomness: the site, its stock, noise, motion.")] = 0,
     day: Annotated[int, Option(help="Day in the site's history: stock moves from day to day.")] = 0,
@@ -77,7 +76,7 @@ def record(
         scenario, seed, day, light, robot, lens, frames, tuple(parse_fault(text) for text in fault or []), _size_px(size),
         HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3), camera_pipeline, rig,
     )  # fmt: skip
-    typer.echo(record_order(order, out))
+    echo(record_order(order, out))
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

@@ -3,15 +3,15 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Context, Exit, Option, echo
 
 from locclient.replay_command import Insecure
 
 
 def check(
-    context: typer.Context,
-    config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
-    seconds: Annotated[float, typer.Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
+    context: Context,
+    config: Annotated[Path, Option(help="The TOML file of `locclient run`.")],
+    seconds: Annotated[float, Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
     insecure: Insecure = False,
 ) -> None:
     """Check a robot before it drives; status 3 if something must be repaired first."""
@@ -22,7 +22,7 @@ def check(
 
     failed = False
     for finding in run_preflight(settings, seconds):
-        typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
+        echo(f"{finding.level:<5} {finding.what}: {finding.text}")
         failed |= finding.level == FAIL
     if failed:
-        raise typer.Exit(3)
+        raise Exit(3)

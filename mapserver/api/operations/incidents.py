@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from fleetmap.errors import InvalidValueError, StateError
 from mapserver.api.operations.operation import Caller, Done, operation
@@ -13,16 +13,16 @@ from mapserver.api.operations.operation import Caller, Done, operation
 Id = Annotated[
     str,
     {"max_length": 500, "examples": ["failure/hall/1"]},
-    typer.Argument(metavar="INCIDENT", help="The incident, as `incidents list` shows it."),
+    Argument(metavar="INCIDENT", help="The incident, as `incidents list` shows it."),
 ]
 _NAME = r"^[\w.@+|/=~'-]+([ :][\w.@+|/=~'-]+)*$"
 _MOST_SIGNS = 64
 Owner = Annotated[
     str,
     {"pattern": _NAME, "max_length": _MOST_SIGNS, "examples": ["bob"]},
-    typer.Option("--to", metavar="NAME", help="Who has it from now on."),
+    Option("--to", metavar="NAME", help="Who has it from now on."),
 ]
-InboxFolder = Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the inboxes, for recordings.")]
+InboxFolder = Annotated[Path | None, Option(metavar="DIR", help="Folder of the inboxes, for recordings.")]
 
 
 @operation("/v1/incidents/acknowledge", "incidents acknowledge")

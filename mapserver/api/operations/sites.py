@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.mapformat.names import NAME_PATTERN
@@ -17,30 +17,30 @@ if TYPE_CHECKING:
 
 _TRUST = "Confirm the calibration although no recording judged it; kept in the manifest; needs --reason."
 _FORCE = "Publish although the gate refuses, except beyond hard limits; needs --reason."
-Site = Annotated[str, typer.Option(help="Name of the site.")]
-Version = Annotated[int, typer.Argument(min=1, metavar="VERSION", help="The version; `versions` lists them.")]
-Draft = Annotated[int | None, typer.Option(min=1, help="Draft to publish; default: the newest.")]
-Trust = Annotated[bool, typer.Option("--trust-calibration", help=_TRUST)]
-Force = Annotated[bool, typer.Option("--force", help=_FORCE)]
-Share = Annotated[float | None, {"gt": 0, "lt": 1, "examples": [0.05]}, typer.Option(help="Default: the setting's.")]
+Site = Annotated[str, Option(help="Name of the site.")]
+Version = Annotated[int, Argument(min=1, metavar="VERSION", help="The version; `versions` lists them.")]
+Draft = Annotated[int | None, Option(min=1, help="Draft to publish; default: the newest.")]
+Trust = Annotated[bool, Option("--trust-calibration", help=_TRUST)]
+Force = Annotated[bool, Option("--force", help=_FORCE)]
+Share = Annotated[float | None, {"gt": 0, "lt": 1, "examples": [0.05]}, Option(help="Default: the setting's.")]
 FirstShare = Annotated[
-    str | None, typer.Option(metavar="SHARE", help="Run it on this share of the robots first, such as 5%.")
+    str | None, Option(metavar="SHARE", help="Run it on this share of the robots first, such as 5%.")
 ]
-BackTo = Annotated[int | None, typer.Option(metavar="VERSION", min=1, help="Only if this one becomes current again.")]
-Trial = Annotated[int | None, typer.Option(metavar="ID", min=1, help="Only if it ends this canary.")]
-AreaName = Annotated[str, typer.Argument(metavar="NAME", help="An area of the site."), {"examples": ["dock"]}]
+BackTo = Annotated[int | None, Option(metavar="VERSION", min=1, help="Only if this one becomes current again.")]
+Trial = Annotated[int | None, Option(metavar="ID", min=1, help="Only if it ends this canary.")]
+AreaName = Annotated[str, Argument(metavar="NAME", help="An area of the site."), {"examples": ["dock"]}]
 Correction = Annotated[
     Literal["forget", "never-use", "freeze", "nothing"],
-    typer.Argument(metavar="forget|never-use|freeze|nothing", help="What maps do there."),
+    Argument(metavar="forget|never-use|freeze|nothing", help="What maps do there."),
 ]
 _ROBOT = {"pattern": NAME_PATTERN, "examples": ["tug-7"]}
-Robots = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots."), _ROBOT]
+Robots = Annotated[list[str], Argument(metavar="ROBOT...", help="Names of robots."), _ROBOT]
 Endpoint = Annotated[
     str | None,
     {"pattern": r"^(tls|quic)/\S+:[0-9]{1,5}$", "max_length": 300},
-    typer.Option(metavar="ENDPOINT", help="Endpoint of the server; default: its certificate's first name."),
+    Option(metavar="ENDPOINT", help="Endpoint of the server; default: its certificate's first name."),
 ]
-Bundles = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")]
+Bundles = Annotated[Path, Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")]
 Part = Annotated[str, {}]  # of an address alone
 _MOST = 1e12  # as fleetmap.encoding, which a command line does not wait for
 _NUMBER = {"ge": -_MOST, "le": _MOST, "examples": [1.57]}

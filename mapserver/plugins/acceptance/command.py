@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Exit, Option, echo
 
 from fleetmap.cli_options import TopicNames, settings_of
 from fleetmap.errors import RecordingError, UsageError
@@ -24,30 +24,26 @@ EXIT_STATUS_NOT_ACCEPTED = 1
 class AcceptOptions(SiteOptions):
     """The drives, and the operator's statements about the robots."""
 
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for acceptance.html, .json and .sig.")]
-    version: Annotated[int | None, typer.Option(min=1, help="Version to judge; default: the current one.")] = None
+    out: Annotated[Path, Option(metavar="DIR", help="Folder for acceptance.html, .json and .sig.")]
+    version: Annotated[int | None, Option(min=1, help="Version to judge; default: the current one.")] = None
     before: Annotated[
         str | None,
-        typer.Option(
-            metavar="EARLIER", help="Compare with an earlier version (its number) or report (its acceptance.json)."
-        ),
+        Option(metavar="EARLIER", help="Compare with an earlier version (its number) or report (its acceptance.json)."),
     ] = None
-    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames of each drive.")] = ":"
+    frames: Annotated[str, Option(metavar="A:B:C", help="Slice of the frames of each drive.")] = ":"
     calibration: Calibration = None
     topic: TopicNames = None
     one_way: Annotated[
-        bool,
-        typer.Option("--one-way", help="Robots drive every aisle as it was surveyed; other directions are no fault."),
+        bool, Option("--one-way", help="Robots drive every aisle as it was surveyed; other directions are no fault.")
     ] = False
     known_starts: Annotated[
-        bool,
-        typer.Option("--known-starts", help="Robots always start at a told place; a start without one is no fault."),
+        bool, Option("--known-starts", help="Robots always start at a told place; a start without one is no fault.")
     ] = False
 
 
 def accept(
-    context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Drives through the site.")],
+    context: Context,
+    recordings: Annotated[list[Path], Argument(metavar="RECORDING...", help="Drives through the site.")],
     options: AcceptOptions,
 ) -> None:
     """Report where and how well robots will be localised at a site, from a version and drives through it.
@@ -79,19 +75,17 @@ def accept(
         write_output(options.out / name, data)
     if signature is not None:
         write_output(options.out / "acceptance.sig", signature)
-    typer.echo(report.verdict)
+    echo(report.verdict)
     for what, found in (("also", report.reasons[1:]), ("worse", report.worse), ("better", report.better)):
         for words in found:
-            typer.echo(f"{what}: {words}")
+            echo(f"{what}: {words}")
     if report.compared_with is not None and not report.worse and not report.better:
-        typer.echo(f"nothing is better or worse than in {report.compared_with}, beyond chance")
-    typer.echo(str(options.out / "acceptance.html"))
+        echo(f"nothing is better or worse than in {report.compared_with}, beyond chance")
+    echo(str(options.out / "acceptance.html"))
     if signature is None:
-        typer.echo(
-            "not signed: the store has no lists, or the online key is elsewhere; see `mapserver trust init`", err=True
-        )
+        echo("not signed: the store has no lists, or the online key is elsewhere; see `mapserver trust init`", err=True)
     if not report.is_accepted:
-        raise typer.Exit(EXIT_STATUS_NOT_ACCEPTED)
+        raise Exit(EXIT_STATUS_NOT_ACCEPTED)
 
 
 def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, SitePlan]]") -> "Report":

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Exit, Option
 
 from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_result, shown_progress
 from mapserver.commands.store import EXIT_STATUS_FAULTS
@@ -12,7 +12,7 @@ from mapserver.commands.store import EXIT_STATUS_FAULTS
 if TYPE_CHECKING:
     from mapserver.plugins.backups.restore import RestoreReport
 
-Where = Annotated[str, typer.Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
+Where = Annotated[str, Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
 
 
 def backup(
@@ -20,11 +20,11 @@ def backup(
     store: StoreFolder,
     recipient: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="AGE1", help="Public key of age for which the store's keys are encrypted; default: without keys."
         ),
     ] = None,
-    keep: Annotated[int, typer.Option(min=1, help="Number of snapshots to keep.")] = 30,
+    keep: Annotated[int, Option(min=1, help="Number of snapshots to keep.")] = 30,
     json: Json = False,
 ) -> None:
     """Back up a store, also while it is served; only what changed since the last time is copied."""
@@ -40,19 +40,17 @@ def backup(
     lines = [f"snapshot {done.snapshot}: {sizes}; {keys}; {len(done.removed)} older ones removed"]
     print_result(done, [*lines, *(f"fault: blob {address} {lost}" for address in done.missing)], json=json)
     if done.missing:
-        raise typer.Exit(EXIT_STATUS_FAULTS)
+        raise Exit(EXIT_STATUS_FAULTS)
 
 
 def restore(
     target: Where,
     *,
-    store: Annotated[Path, typer.Option(help="Folder of the new store; it must not exist, or be empty.")],
+    store: Annotated[Path, Option(help="Folder of the new store; it must not exist, or be empty.")],
     snapshot: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Snapshot, as `mapserver backups` lists them; default: the last.")
+        str | None, Option(metavar="TIME", help="Snapshot, as `mapserver backups` lists them; default: the last.")
     ] = None,
-    identity: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Private key of age, for the store's keys.")
-    ] = None,
+    identity: Annotated[Path | None, Option(metavar="FILE", help="Private key of age, for the store's keys.")] = None,
     by: ActorOptions,
     json: Json = False,
 ) -> None:
@@ -86,7 +84,7 @@ def _restored(done: "RestoreReport", store: Path) -> Iterator[str]:
 
 def backups(
     target: Where,
-    verify: Annotated[bool, typer.Option("--verify", help="Read every byte; status 3 for a fault.")] = False,
+    verify: Annotated[bool, Option("--verify", help="Read every byte; status 3 for a fault.")] = False,
     json: Json = False,
 ) -> None:
     """List the snapshots of a backup."""
@@ -104,4 +102,4 @@ def backups(
     lines += [f"fault: {fault}" for fault in found.faults]
     print_result(found, [*lines, f"{len(found.faults)} faults" if found.faults else "clean"], json=json)
     if found.faults:
-        raise typer.Exit(EXIT_STATUS_FAULTS)
+        raise Exit(EXIT_STATUS_FAULTS)

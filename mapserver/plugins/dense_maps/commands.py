@@ -3,28 +3,26 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, echo
 
 from fleetmap.cli_options import Group, TopicNames
 from fleetmap.errors import StateError, UsageError, disk_errors
 from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, version_named, write_output
 
 RobotHeight = Annotated[
-    float, typer.Option(metavar="METRES", help="Height of the tallest robot: higher objects are not obstacles.")
+    float, Option(metavar="METRES", help="Height of the tallest robot: higher objects are not obstacles.")
 ]
 
 
 def export(
-    file: Annotated[
-        Path, typer.Argument(metavar="OUT.yaml", help="File to write; its image OUT.pgm is written beside it.")
-    ],
+    file: Annotated[Path, Argument(metavar="OUT.yaml", help="File to write; its image OUT.pgm is written beside it.")],
     site: SiteName,
     store: StoreFolder,
-    version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
+    version: Annotated[int | None, Option(min=1, help="Version; default: the current one.")] = None,
     robot_height: RobotHeight = 1.1,
     heights: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npz", help="Write the lowest and highest surface of each cell to this file, too."),
+        Option(metavar="FILE.npz", help="Write the lowest and highest surface of each cell to this file, too."),
     ] = None,
 ) -> None:
     """Write the occupancy grid of a version for nav2's map_server, in the robots' map frame."""
@@ -47,7 +45,7 @@ def export(
             np.savez_compressed(stream, lowest_m=lowest, highest_m=highest, corner_map_m=corner_map_m, cell_m=CELL_M)
     rows, columns = grid.cells.shape
     free_m2, occupied_m2 = ((grid.cells == state).sum() * grid.resolution_m**2 for state in (FREE, OCCUPIED))
-    typer.echo(
+    echo(
         f"site {site}: grid of version {version} is in {file}: {columns} x {rows} cells of {grid.resolution_m} m, "
         f"{free_m2:.1f} m2 free, {occupied_m2:.1f} m2 occupied"
     )
@@ -56,8 +54,8 @@ def export(
 GRID = Group("Planner grid of a version.", {"export": export})
 
 
-SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version built with the setting surfel_map.")]
-SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply; replaced if it exists.")]
+SurfelVersion = Annotated[int, Argument(min=1, help="Version built with the setting surfel_map.")]
+SplatFile = Annotated[Path, Argument(metavar="FILE", help="File to write, .ply; replaced if it exists.")]
 
 
 def splats(version: SurfelVersion, file: SplatFile, site: SiteName, store: StoreFolder) -> None:
@@ -70,15 +68,13 @@ def splats(version: SurfelVersion, file: SplatFile, site: SiteName, store: Store
         surfels = surfels_of(maps.manifest(site, version), maps.blob)
     data = splat_ply(Splats.of(surfels))
     write_output(file, data)
-    typer.echo(f"site {site}: {len(surfels)} surfels of version {version} are in {file}, {len(data) / 1e6:.1f} MB")
+    echo(f"site {site}: {len(surfels)} surfels of version {version} are in {file}, {len(data) / 1e6:.1f} MB")
 
 
 def changes(
     before: SurfelVersion,
-    after: Annotated[int, typer.Argument(min=1, help="Another one.")],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="File to write, .png or .geojson; replaced if it exists.")
-    ],
+    after: Annotated[int, Argument(min=1, help="Another one.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="File to write, .png or .geojson; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
 ) -> None:
@@ -97,7 +93,7 @@ def changes(
         f"{sum(patch.kind == kind for patch in found.patches)} patches {kind} ({found.area_m2(kind):.2f} m2)"
         for kind in (APPEARED, VANISHED)
     )
-    typer.echo(
+    echo(
         f"site {site}, version {before} to {after}: {said}; {file} has them"
         + (f", its lower left corner at ({x:.2f}, {y:.2f}) m, {CELL_M} m a pixel" if is_picture else "")
     )
@@ -105,12 +101,12 @@ def changes(
 
 def refine(
     version: SurfelVersion,
-    recording: Annotated[Path, typer.Argument(help="Recording used to build this version.")],
+    recording: Annotated[Path, Argument(help="Recording used to build this version.")],
     file: SplatFile,
     site: SiteName,
     store: StoreFolder,
-    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the images.")] = 0,
+    steps: Annotated[int, Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
+    seed: Annotated[int, Option(min=0, help="Seed of the order of the images.")] = 0,
     topic: TopicNames = None,
 ) -> None:
     """Write the surfels as in `map splats`, with colours, sizes and opacities fitted to the pictures of their recording."""
@@ -148,7 +144,7 @@ def refine(
         )
     data = splat_ply(done.splats)
     write_output(file, data)
-    typer.echo(f"{said}, from {done.learned} other images; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
+    echo(f"{said}, from {done.learned} other images; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
 
 
 MAP = Group("Surfels of a version.", {"splats": splats, "changes": changes, "refine": refine})

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Option, echo
 
 from fleetmap.cli_options import config_path
 from fleetmap.errors import LinkError, UsageError
@@ -26,26 +26,25 @@ _LOOPBACK = "127.0.0.1"
 class LiveCommandOptions(SurveyOptions):
     """Options of `live` beside those of `nightly`."""
 
-    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
-    speed: Annotated[float, typer.Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
+    use: Annotated[str | None, Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
+    speed: Annotated[float, Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
     sensors: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
+        Path | None, Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
     ] = None
-    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Recording of --sensors to write.")] = None
+    record: Annotated[Path | None, Option(metavar="FILE.mcap", help="Recording of --sensors to write.")] = None
     server: Annotated[
-        str | None,
-        typer.Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey."),
+        str | None, Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey.")
     ] = None
     foxglove: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there, without sign-in.")
+        str | None, Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there, without sign-in.")
     ] = None
-    insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines connect to --foxglove.")] = False
+    insecure: Annotated[bool, Option("--insecure", help="Let other machines connect to --foxglove.")] = False
 
 
 def live(
-    context: typer.Context,
+    context: Context,
     options: LiveCommandOptions,
-    recording: Annotated[Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
+    recording: Annotated[Path | None, Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
 ) -> None:
     """Map a survey during the drive; Ctrl-C ends the drive and stores a draft."""
     options.check()
@@ -77,7 +76,7 @@ def live(
             from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
 
             foxglove = opened.enter_context(FoxgloveServer(*at, options.site))
-            typer.echo(f"foxglove: {foxglove.url}")
+            echo(f"foxglove: {foxglove.url}")
         paths = tuple(path for path in (recording, options.record) if path is not None)
         request = BuildRequest(paths, options.site, options.store, build)
         if recording is not None:
@@ -92,8 +91,8 @@ def live(
         if options.server is not None:
             tells.append(partial(_publish, opened.enter_context(_bus(options.server, options.store))))
         figures, built = run_live(drive, tells, stopped.is_set, plain_console(stderr=True), see)
-    typer.echo(figures.words())
-    typer.echo(built.sentence)
+    echo(figures.words())
+    echo(built.sentence)
 
 
 def _stopping() -> threading.Event:

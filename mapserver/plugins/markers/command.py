@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Context, Option, echo
 
 from fleetmap.cli_options import TopicNames
 from fleetmap.errors import RecordingError, UsageError
@@ -16,23 +16,23 @@ from mapserver.commands.options import Calibration, SiteOptions, open_store
 class MarkerOptions(SiteOptions):
     """The markers, and the files to write."""
 
-    size: Annotated[float, typer.Option(metavar="M", min=0.001, help="Side of the markers' black square, metres.")]
-    out: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write the list here.")] = None
-    dictionary: Annotated[str, typer.Option(metavar="NAME", help="OpenCV's name, without DICT_.")] = "APRILTAG_36h11"
-    version: Annotated[int | None, typer.Option(min=1, help="Version to measure in; default: the current one.")] = None
+    size: Annotated[float, Option(metavar="M", min=0.001, help="Side of the markers' black square, metres.")]
+    out: Annotated[Path | None, Option(metavar="FILE.json", help="Write the list here.")] = None
+    dictionary: Annotated[str, Option(metavar="NAME", help="OpenCV's name, without DICT_.")] = "APRILTAG_36h11"
+    version: Annotated[int | None, Option(min=1, help="Version to measure in; default: the current one.")] = None
     known: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="List with known distances: measure the rig's scale.")
+        Path | None, Option(metavar="FILE.json", help="List with known distances: measure the rig's scale.")
     ] = None
     scaled: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the calibration here with baselines by that scale.")
+        Path | None, Option(metavar="FILE.yaml", help="Write the calibration here with baselines by that scale.")
     ] = None
     calibration: Calibration = None
     topic: TopicNames = None
 
 
 def markers(
-    context: typer.Context,
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Survey of the version.")],
+    context: Context,
+    recording: Annotated[Path, Argument(metavar="RECORDING", help="Survey of the version.")],
     options: MarkerOptions,
 ) -> None:
     """Measure where the markers of a site stand, by a version and the recording that it was built from."""
@@ -59,11 +59,11 @@ def markers(
         found = measure_markers(opened, survey.trajectory, options.size, options.dictionary)
     for marker in found.markers:
         x_m, y_m, z_m = marker.map_from_marker.position_m
-        typer.echo(f"marker {marker.id}: {x_m:.3f} {y_m:.3f} {z_m:.3f} m, sigma {1e3 * marker.sigma_m:.0f} mm")
+        echo(f"marker {marker.id}: {x_m:.3f} {y_m:.3f} {z_m:.3f} m, sigma {1e3 * marker.sigma_m:.0f} mm")
     if options.out is not None:
         common.write_output(options.out, to_json(found, indent=2) + b"\n")
     if known is not None:
         scale = scale_by(found, known)
-        typer.echo(f"scale: a metre of the map is {scale:.5f} m")
+        echo(f"scale: a metre of the map is {scale:.5f} m")
         if options.scaled is not None:
             common.write_output(options.scaled, format_calibration(scaled(rig, scale)).encode())

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Context, Option, echo
 
 from fleetmap.cli_options import settings_of
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
@@ -17,13 +17,13 @@ from mapserver.commands.options import SurveyOptions
 class NightlyOptions(SurveyOptions):
     """Options of `nightly` beside those of `build`."""
 
-    inbox: Annotated[Path, typer.Option(metavar="DIR", help="Folder that recordings are copied into.")]
+    inbox: Annotated[Path, Option(metavar="DIR", help="Folder that recordings are copied into.")]
     settle_s: Annotated[
-        float, typer.Option("--settle-s", min=0, help="A recording unchanged for this many seconds is complete.")
+        float, Option("--settle-s", min=0, help="A recording unchanged for this many seconds is complete.")
     ] = 300.0
 
 
-def nightly(context: typer.Context, options: NightlyOptions) -> None:
+def nightly(context: Context, options: NightlyOptions) -> None:
     """Check, build, judge and publish the recordings in the inbox; one run at a time for each site.
 
     Status 0 also for an empty inbox, 4 if the gate refuses, 5 if another run is at work.
@@ -48,7 +48,7 @@ def nightly(context: typer.Context, options: NightlyOptions) -> None:
             _write_report(options)
         raise
     _write_report(options)
-    typer.echo(sentence)
+    echo(sentence)
 
 
 def _write_report(options: NightlyOptions) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Context, Option, echo
 
 from fleetmap.cli_options import TopicNames, config_path
 from fleetmap.errors import RecordingError, UsageError, disk_errors
@@ -21,17 +21,16 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or files of one rig.")],
+    context: Context,
+    recordings: Annotated[list[Path], Argument(metavar="RECORDING...", help="Folders or files of one rig.")],
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
+        Path | None, Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain.")
     ] = None,
     calibration: Calibration = None,
     topic: TopicNames = None,
     guess: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="WxH:M", help="Without a calibration: raw image size and metres between the cameras, 752x480:0.11."
         ),
     ] = None,
@@ -78,7 +77,7 @@ def _sound(recording: "Recording") -> "Recording":
 
     sound, _ = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
     for issue in sound.issues:
-        typer.echo(f"issue: {sound.name}: {issue.what}: {issue.detail}", err=True)
+        echo(f"issue: {sound.name}: {issue.what}: {issue.detail}", err=True)
     return sound
 
 
@@ -96,7 +95,7 @@ def _shown() -> "Iterator[SurveyTools]":
 def _write(out: Path, text: str, advice: str) -> None:
     with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
         out.write_text(text, encoding="utf-8")
-    typer.echo(f"{out}: written; {advice}")
+    echo(f"{out}: written; {advice}")
 
 
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
@@ -121,7 +120,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
                 _sound(recording.view(0)), survey_settings(config, recording.sensor_set), tools
             )
             name = recording.name
-    typer.echo("\n".join(from_guess.guessed_in_words(found)))
+    echo("\n".join(from_guess.guessed_in_words(found)))
     if out is not None:
         advice = f"add the pose of the IMU, then calibrate again with --calibration {out}"
         _write(out, from_guess.guessed_file(found, name), advice)
