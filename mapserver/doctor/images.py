@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Array32
 from fleetmap.recordings import Recording
 from fleetmap.sensors.lens_fit import DOUBTFUL_RATIO, FITS_PX2, lens_of_frames
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -128,7 +127,7 @@ def _cells(fine: Array) -> Array:
 _RANGE_M = (0.05, 100.0)
 
 
-def depth_share(depth_m: NDArray[np.float32]) -> float:
+def depth_share(depth_m: Array32) -> float:
     """Return the share of the pixels (H, W) with a depth within the range of sensors."""
     return float(((depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])).mean())
 

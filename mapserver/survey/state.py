@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features import orb, patch_align
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import AnyArray, Array, Indices, Mask, transform_points
+from fleetmap.geometry import AnyArray, Array, Array32, Indices, Mask, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -175,7 +175,7 @@ class FrameTracks:
 
     starts: Indices
     ids: NDArray[np.int32]
-    pixels: NDArray[np.float32]
+    pixels: Array32
 
     @classmethod
     def of_frame(cls, estimate: OdometryEstimate) -> "FrameTracks":

@@ -132,10 +132,7 @@ class Sighting(NamedTuple):
 
 
 def choose_landmarks(
-    survey: SurveyMap,
-    settings: BudgetSettings,
-    published: NDArray[np.uint32] | None = None,
-    sightings: Sequence[Sighting] = (),
+    survey: SurveyMap, settings: BudgetSettings, published: _Ids | None = None, sightings: Sequence[Sighting] = ()
 ) -> Mask:
     """Return (N,) which landmarks of the survey robots get.
 

@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetsim.scene.layout import Layout
 
 STEP_M = 0.01
@@ -252,7 +251,7 @@ class CarriedMotion:
         """As RouteMotion.velocity_body of the piece in force, as measured by wheels, without the lift."""
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
-    def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:
+    def _local(self, times_s: Array) -> tuple[Indices, Array]:
         """(N,) the piece in force, and the time since the robot stood on the ground, which is negative before."""
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
         return piece, times_s - np.concatenate([[0.0], self._ends_s[:-1] + self._down_s])[piece]

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import CalibrationError
-from fleetmap.geometry import Array, se3_inverse, so3_exp
+from fleetmap.geometry import Array, Array32, Mask, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import Image
 from fleetsim.motion import Motion
@@ -36,7 +35,7 @@ class Plane:
 
     cam_from_plane: Array
     pinhole: Array
-    rays: NDArray[np.float32]
+    rays: Array32
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,7 @@ class Optics:
     """
 
     planes: tuple[Plane, ...]
-    vignetting: NDArray[np.float32]
+    vignetting: Array32
 
 
 def make_optics(camera: CameraCalibration) -> Optics:
@@ -84,7 +83,7 @@ def make_optics(camera: CameraCalibration) -> Optics:
     return Optics(tuple(planes), _vignetting(half - 1.0))
 
 
-def _tangents(around: list[Array], cam_from_plane: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _tangents(around: list[Array], cam_from_plane: Array) -> tuple[Array, Mask]:
     """(H, W, 4) as in Plane of the rays at pixels, right, left, below and above of them; True for pixels that the plane does not show."""
     turned = (rays @ cam_from_plane for rays in around)
     here, right, left, below, above = (
@@ -95,7 +94,7 @@ def _tangents(around: list[Array], cam_from_plane: Array) -> tuple[Array, NDArra
     return tangents, np.asarray(~is_seen)
 
 
-def _plane(camera: CameraCalibration, cam_from_plane: Array, tangents: Array, unseen: NDArray[np.bool_]) -> Plane:
+def _plane(camera: CameraCalibration, cam_from_plane: Array, tangents: Array, unseen: Mask) -> Plane:
     fx, fy = (_PLANE_SCALE * float(value) for value in camera.focal_px)
     seen = tangents[~unseen]
     margin = 2.0
@@ -106,14 +105,14 @@ def _plane(camera: CameraCalibration, cam_from_plane: Array, tangents: Array, un
     return Plane(cam_from_plane, pinhole, np.where(unseen[..., None], 1e6, tangents).astype(np.float32))
 
 
-def _vignetting(squared_tangent: Array) -> NDArray[np.float32]:
+def _vignetting(squared_tangent: Array) -> Array32:
     return np.asarray((1.0 + squared_tangent) ** -1.5, np.float32)
 
 
 Path = Callable[[float], Array]  # t_s -> map_from_cam
 # One of an exposure: samples per pixel side, their shift in pixels, weight in the picture.
 _Instant = tuple[int, tuple[float, float], float]
-_Canvas = tuple[Array, NDArray[np.float32]]  # a picture in the making (H, W): radiance, depth
+_Canvas = tuple[Array, Array32]  # a picture in the making (H, W): radiance, depth
 _BLUR_STEP_PX, _MOST_SUBFRAMES, _NEAR_THINGS_M = 1.2, 8, 1.5
 _R2_SEQUENCE = np.array([0.7548776662, 0.5698402910])
 _NOISE_TABLE = 1 << 18
@@ -129,7 +128,7 @@ class Shot(NamedTuple):
     """
 
     image: Image
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
 
 
 class Painter:

@@ -8,10 +8,9 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError, chosen
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import Array, Array32, se3, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, WheelSample
 from fleetsim.motion import Limits, Motion, Shake
@@ -176,9 +175,7 @@ def _bias(rng: np.random.Generator, count: int, first: float, walk: float, dt_s:
     return np.asarray(rng.normal(0.0, first, 3) + np.cumsum(steps, axis=0))
 
 
-def measure_depth(
-    depth_m: NDArray[np.float32], camera: CameraCalibration, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def measure_depth(depth_m: Array32, camera: CameraCalibration, rng: np.random.Generator) -> Array32:
     """Depth (H, W) in whole mm as an active stereo camera gives it, 0 out of its range.
 
     Source of range and noise: Keselman et al. 2017, Intel RealSense stereoscopic depth cameras; a base of 50 mm, matched to 0.08 px.

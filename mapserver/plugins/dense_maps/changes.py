@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import UsageError
-from fleetmap.geometry import Array, Indices, Mask, se3, se3_inverse
+from fleetmap.geometry import Array, Array32, Indices, Mask, se3, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.plugins.dense_maps.expected_view import expected_depth
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT
@@ -113,7 +112,7 @@ def changes_geojson(changes: Changes) -> dict[str, Any]:
     return {"type": "FeatureCollection", "frame": "map", "features": features}
 
 
-def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
+def _plan(places_m: Array32) -> tuple[Array, tuple[int, int]]:
     """Return the corner of a plan that contains places (N, 2), and its rows and columns."""
     low, high = np.floor(np.stack([places_m.min(axis=0), places_m.max(axis=0)]) / CELL_M).astype(np.int64)
     columns, rows = (high - low + 1).tolist()
@@ -122,7 +121,7 @@ def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
     return low * CELL_M, (rows, columns)
 
 
-def _fill(layer: Mask, points_map: Array | NDArray[np.float32], corner_m: Array) -> None:
+def _fill(layer: Mask, points_map: Array | Array32, corner_m: Array) -> None:
     columns, rows = np.floor((points_map[:, :2] - corner_m) / CELL_M + 1e-6).astype(np.int64).T
     layer[np.clip(rows, 0, layer.shape[0] - 1), np.clip(columns, 0, layer.shape[1] - 1)] = True
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Array32
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
@@ -19,9 +19,7 @@ _FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 100
 _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
 
 
-def dense_disparity(
-    frame: RectifiedFrame, camera: StereoCamera, settings: StereoSettings
-) -> tuple[NDArray[np.float32], float]:
+def dense_disparity(frame: RectifiedFrame, camera: StereoCamera, settings: StereoSettings) -> tuple[Array32, float]:
     """Return disparities of every STEP_PX-th pixel each way, NaN if unknown, and their standard deviation in pixels.
 
     From the depth sensor if present. A pair is matched in both directions; areas without texture are unknown.
@@ -49,13 +47,13 @@ def _smaller(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[np.float32]:
+def nearest_around(disparity_px: Array32, reach_px: int) -> Array32:
     """Return the largest disparity around each of `dense_disparity`, 0 if unknown."""
     block = np.ones((2 * (reach_px // STEP_PX) + 1,) * 2, np.uint8)
     return np.asarray(cv2.dilate(np.fmax(disparity_px, np.float32(0.0)), block), np.float32)
 
 
-def floor_distance_m(images: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
+def floor_distance_m(images: Iterable[tuple[Array32, Array]], camera: StereoCamera) -> float | None:
     """Return the distance of the ground below the camera, of some images by `dense_disparity` and map_from_cam (4, 4).
 
     Per view the most frequent height of near points below the camera; the median, if most images agree. None if

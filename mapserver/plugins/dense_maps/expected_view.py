@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import CalibrationError, UsageError
-from fleetmap.geometry import Array, Mask, se3_inverse
+from fleetmap.geometry import Array, Array32, Mask, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.plugins.dense_maps.exposure import lens_factor
@@ -29,7 +29,7 @@ class ExpectedView:
     """A picture (H, W) uint8, depths in m along the rays (H, W), NaN if unknown, and the mask of unknown pixels (H, W)."""
 
     picture: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
     unknown: Mask
 
 
@@ -100,7 +100,7 @@ def _drawn(
     return rays, *core.draw_discs(*discs, far_m, RADIUS_EDGES, rays, pixels_per_rad)
 
 
-def filled(picture: NDArray[np.float32], unknown: Mask) -> NDArray[np.float32]:
+def filled(picture: Array32, unknown: Mask) -> Array32:
     """Fill unknown pixels of the picture (H, W) smoothly from their neighbours; grey without any. Source: Gortler et al. 1996."""
     known = (~unknown).astype(np.float32)
     if not known.any():
@@ -132,7 +132,7 @@ def brightness(surfels: Surfels, map_from_cam: Array) -> float:
 @lru_cache(maxsize=8)
 def _lens(
     model: str, width_px: int, height_px: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
-) -> tuple[Array, NDArray[np.float32], float]:
+) -> tuple[Array, Array32, float]:
     """Return rays (H, W, 3), the finest pixels per radian around each (H, W), and the cosine of the cone that contains all rays."""
     camera = CameraCalibration(model, width_px, height_px, np.array(intrinsics), np.array(distortion), np.eye(4))
     v, u = np.mgrid[0:height_px, 0:width_px].astype(np.float64)

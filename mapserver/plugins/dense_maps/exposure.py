@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, Indices
+from fleetmap.geometry import Array, Array32, Indices
 from fleetmap.sensors.rectification import StereoCamera
 
 FALLOFF = 3  # coefficients: of the squared tangent of the angle to the axis and of its powers
@@ -32,7 +31,7 @@ class Exposure:
     falloff: Array
 
 
-def squared_tangent(pixels: NDArray[np.float32], camera: StereoCamera) -> Array:
+def squared_tangent(pixels: Array32, camera: StereoCamera) -> Array:
     """Return (N,) squared tangents of the angle to the axis, of pixels (N, 2)."""
     off = (pixels.astype(np.float64) - np.array([camera.cx_px, camera.cy_px])) / camera.focal_px
     return np.asarray((off**2).sum(axis=1))

@@ -4,10 +4,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core, version_grid
-from fleetmap.geometry import Array, Indices
+from fleetmap.geometry import Array, Array32, Indices
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M, FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, TILE_CELLS, Counts, Tiles
 from mapserver.plugins.dense_maps.dense_stereo import BLOCK_PX
@@ -33,11 +32,7 @@ class SessionViews:
     tiles: dict[tuple[int, int], tuple[Counts, Counts, Counts, Counts]] = field(default_factory=dict)
 
     def add(
-        self,
-        disparity: tuple[NDArray[np.float32], NDArray[np.float32], float],
-        camera: StereoCamera,
-        map_from_cam: Array,
-        floor_m: float,
+        self, disparity: tuple[Array32, Array32, float], camera: StereoCamera, map_from_cam: Array, floor_m: float
     ) -> None:
         """Add one view. disparity: as of `dense_disparity`, with that of `nearest_around` between; floor_m: distance of the ground."""
         size = 2 * _RANGE_CELLS + 1

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, Indices, se3_inverse
+from fleetmap.geometry import Array, Array32, Indices, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.plugins.dense_maps.surfel_map import Surfels
 
@@ -23,8 +22,8 @@ _TINY = 1e-6
 class Splats:
     """N flat Gaussians in `map`: points_map, unit normals (N, 3), sigmas_m (N,) along the disc, greys (N,) of 0 to 255, opacities (N,)."""
 
-    points_map: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    points_map: Array32
+    normals: Array32
     sigmas_m: Array
     greys: Array
     opacities: Array

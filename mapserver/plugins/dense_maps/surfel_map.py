@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError
-from fleetmap.geometry import AnyArray, Array, Indices, Mask
+from fleetmap.geometry import AnyArray, Array, Array32, Indices, Mask
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Manifest, Positive, TileEntry, manifest_entry
 from fleetmap.mapformat.names import sha256_hex
@@ -47,8 +47,8 @@ class Surfels:
     the greys. exposures (K, 7): positions, viewing directions and logarithms of the brightness of the drives' images.
     """
 
-    points_map: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    points_map: Array32
+    normals: Array32
     levels: NDArray[np.uint8]
     greys: NDArray[np.uint8]
     falloff: tuple[float, ...] = NO_FALLOFF
@@ -62,7 +62,7 @@ class Surfels:
         return Surfels(*each, self.falloff, self.exposures)
 
     @property
-    def edges_m(self) -> NDArray[np.float32]:
+    def edges_m(self) -> Array32:
         """(N,) edges of the voxels."""
         return np.float32(EDGE_M) * np.exp2(self.levels, dtype=np.float32)
 
@@ -228,14 +228,14 @@ def _decode_tile(data: bytes) -> tuple[tuple[int, int], Surfels]:
     return (x, y), Surfels(points.astype(np.float32), _normals(turned.T), levels[0].copy(), greys[0].copy())
 
 
-def _octahedron(normals: NDArray[np.float32]) -> NDArray[np.int8]:
+def _octahedron(normals: Array32) -> NDArray[np.int8]:
     """Return (N, 2) octahedral codes of unit vectors (N, 3). Source: Meyer et al. 2010, on floating-point normal vectors."""
     flat = normals[:, :2] / np.abs(normals).sum(axis=1, keepdims=True)
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)
     return np.asarray(np.round(np.where(normals[:, 2:] < 0, folded, flat) * _TURN), np.int8)
 
 
-def _normals(turned: NDArray[np.int8]) -> NDArray[np.float32]:
+def _normals(turned: NDArray[np.int8]) -> Array32:
     flat = turned.astype(np.float32) / np.float32(_TURN)
     height = 1.0 - np.abs(flat).sum(axis=1)
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)

@@ -7,10 +7,9 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Array32
 from fleetmap.version_grid import Counts, Tiles
 from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.dense_stereo import STEP_PX, dense_disparity, floor_distance_m, nearest_around
@@ -31,12 +30,12 @@ class DepthView:
     """A keyframe with its disparities as of `dense_disparity`, their standard deviation, and its pose (4, 4)."""
 
     keyframe: Keyframe
-    disparity_px: NDArray[np.float32]
+    disparity_px: Array32
     sigma_px: float
     map_from_cam: Array
 
     @cached_property
-    def nearest_px(self) -> NDArray[np.float32]:
+    def nearest_px(self) -> Array32:
         """Disparities as of `nearest_around`, as far around each pixel as its depth may belong to."""
         return nearest_around(self.disparity_px, REACH_PX)
 

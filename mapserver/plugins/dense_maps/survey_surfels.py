@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, Indices, Mask, se3_inverse
+from fleetmap.geometry import Array, Array32, Indices, Mask, se3_inverse
 from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
@@ -42,8 +42,8 @@ class _Look(NamedTuple):
     standard deviation; the smoothed picture; its pose.
     """
 
-    disparity_px: NDArray[np.float32]
-    nearest_px: NDArray[np.float32]
+    disparity_px: Array32
+    nearest_px: Array32
     picture: NDArray[np.uint8]
     sigma_px: float
     map_from_cam: Array
@@ -206,7 +206,7 @@ class _Images:
         self._normals = np.array([sides @ look.cam_from_map[:3, :3] for look in looks]).reshape(-1, 4, 3)
         self.places = np.array([look.map_from_cam[:3, 3] for look in looks]).reshape(-1, 3)
 
-    def seeing(self, points_map: NDArray[np.float32]) -> list[int]:
+    def seeing(self, points_map: Array32) -> list[int]:
         """Return the numbers of the images that may see some of these points (N, 3)."""
         low, high = points_map.min(axis=0).astype(np.float64), points_map.max(axis=0).astype(np.float64)
         middle, half = (low + high) / 2 - self.places, (high - low) / 2
@@ -230,7 +230,7 @@ def _points(look: _Look, camera: StereoCamera, step: int) -> Array:
     return np.asarray(points @ look.map_from_cam[:3, :3].T + look.map_from_cam[:3, 3])
 
 
-def _blocks(points_map: NDArray[np.float32]) -> tuple[Indices, list[slice]]:
+def _blocks(points_map: Array32) -> tuple[Indices, list[slice]]:
     """Return an order of points in which those of a block follow each other, and the rows of each block."""
     places = np.floor(points_map / _BLOCK_M).astype(np.int64) + (1 << 19)
     keys = places @ [1 << 40, 1 << 20, 1]  # on integers, not on rows: thirty times faster
@@ -256,5 +256,5 @@ def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> Mask:
     return known
 
 
-def _keys(points_map: NDArray[np.float32], level: int) -> Indices:
+def _keys(points_map: Array32, level: int) -> Indices:
     return core.voxel_keys(points_map, np.full(len(points_map), level, np.uint8))

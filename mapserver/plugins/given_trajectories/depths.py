@@ -6,10 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import AnyArray, Array, Indices
+from fleetmap.geometry import AnyArray, Array, Array32, Indices
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame
@@ -89,7 +88,7 @@ class DepthFrames(WrappedFrames):
     def part(self, indices: Indices) -> "DepthFrames":
         return replace(self, source=self.source.part(indices), rows=self.rows[indices])
 
-    def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _depth_m(self, inverse: Array32) -> Array32:
         """Return metres at recorded pixels: inverse depth is linear on planes, so it is interpolated between neighbours of one surface."""
         x, y = self._places
         (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
@@ -107,7 +106,7 @@ class DepthFrames(WrappedFrames):
         return array_in(self.file)
 
     @cached_property
-    def _places(self) -> NDArray[np.float32]:
+    def _places(self) -> Array32:
         """(2, H, W) for each recorded pixel its position x, y in the images, which have no distortion; -9 if outside."""
         pinhole = _pinhole(self.file, self.camera, self._images.shape[1:])
         size = self.camera.height_px, self.camera.width_px

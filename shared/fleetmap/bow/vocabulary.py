@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import MapFormatError, check_format
 from fleetmap.features.matching import Descriptors, Packed, packed
-from fleetmap.geometry import Indices, Mask
+from fleetmap.geometry import Array32, Indices, Mask
 
 WordIds = NDArray[np.int32]
 VOCABULARY_FORMAT = 1
@@ -41,7 +41,7 @@ class BowVector:
     """Appearance of a place: word_ids (W,) ascending, weights (W,) positive with sum 1 (both empty without words)."""
 
     word_ids: WordIds
-    weights: NDArray[np.float32]
+    weights: Array32
 
     def __len__(self) -> int:
         return len(self.word_ids)
@@ -58,7 +58,7 @@ class Vocabulary:
     centres: Packed
     first_child: NDArray[np.int32]
     child_count: NDArray[np.int32]
-    idf: NDArray[np.float32]
+    idf: Array32
 
     @property
     def word_count(self) -> int:

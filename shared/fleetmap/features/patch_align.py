@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.features.settings import AlignSettings
-from fleetmap.geometry import Array, Indices
+from fleetmap.geometry import Array, Array32, Indices
 from fleetmap.sensors.samples import Image
 
 Pyramid = tuple[Image, Image, Image]
@@ -27,7 +27,7 @@ class Patches(NamedTuple):
     pyramid: Pyramid
     pixels: Array
     octaves: NDArray[np.int8]
-    angles_deg: NDArray[np.float32]
+    angles_deg: Array32
     chosen: Indices
 
     @classmethod

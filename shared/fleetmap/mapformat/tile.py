@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import MapFormatError
-from fleetmap.geometry import Array, Indices, quat_wxyz_from_rotation
+from fleetmap.geometry import Array, Array32, Indices, quat_wxyz_from_rotation
 from fleetmap.mapformat.container import pack, unpack
 
 Ids = NDArray[np.uint32]
@@ -36,10 +36,10 @@ class Tile:
     landmark_ids: Ids
     points_map: Array
     descriptors: NDArray[np.uint8]
-    view_directions_map: NDArray[np.float32]
-    view_half_angle_rad: NDArray[np.float32]
-    max_distance_m: NDArray[np.float32]
-    sigma_m: NDArray[np.float32]
+    view_directions_map: Array32
+    view_half_angle_rad: Array32
+    max_distance_m: Array32
+    sigma_m: Array32
     place_ids: Ids
     map_from_cam: Array
     place_landmark_ids: tuple[Ids, ...]
@@ -123,29 +123,29 @@ _DISTANCE_M = (0.1, 8)  # smallest value, codes per octave
 _SIGMA_M = (1e-4, 4)
 
 
-def log_code(values: NDArray[np.float32], smallest: float, steps_per_octave: int) -> NDArray[np.uint8]:
+def log_code(values: Array32, smallest: float, steps_per_octave: int) -> NDArray[np.uint8]:
     """Codes c of values ~ smallest * 2 ** (c / steps_per_octave), clipped to 0..255."""
     octaves = np.log2(np.maximum(values.astype(np.float64), smallest) / smallest)
     return np.minimum(np.round(octaves * steps_per_octave), 255).astype(np.uint8)
 
 
-def log_value(codes: NDArray[np.uint8], smallest: float, steps_per_octave: int) -> NDArray[np.float32]:
+def log_value(codes: NDArray[np.uint8], smallest: float, steps_per_octave: int) -> Array32:
     """Values of `log_code`'s codes."""
     return (smallest * np.exp2(codes.astype(np.float64) / steps_per_octave)).astype(np.float32)
 
 
-def half_angle_code(angles_rad: NDArray[np.float32]) -> NDArray[np.uint8]:
+def half_angle_code(angles_rad: Array32) -> NDArray[np.uint8]:
     """Codes of angles from 0 to pi."""
     steps = np.round(angles_rad.astype(np.float64) * (_HALF_ANGLE_STEPS / np.pi))
     return np.clip(steps, 0, _HALF_ANGLE_STEPS).astype(np.uint8)
 
 
-def half_angle_value(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+def half_angle_value(codes: NDArray[np.uint8]) -> Array32:
     """Angles in radians of codes; those above the last one mean pi."""
     return (np.minimum(codes, _HALF_ANGLE_STEPS) * (np.pi / _HALF_ANGLE_STEPS)).astype(np.float32)
 
 
-def direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
+def direction_code(directions: Array32) -> NDArray[np.int8]:
     """(N, 2) octahedral codes, about 2.9 degrees apart, of directions (N, 3). Source: Meyer et al. 2010."""
     # Twice, because directions on the folded edge of the octahedron have two codes: the second pass picks one.
     for _ in range(2):
@@ -164,7 +164,7 @@ def _folded(plane: Array) -> Array:
     return np.asarray((1.0 - np.abs(plane[:, ::-1])) * np.where(plane >= 0, 1.0, -1.0))
 
 
-def direction_value(codes: NDArray[np.int8]) -> NDArray[np.float32]:
+def direction_value(codes: NDArray[np.int8]) -> Array32:
     """(N, 3) unit directions of octahedral codes (N, 2)."""
     plane = np.clip(codes.astype(np.float64), -_DIRECTION_STEPS, _DIRECTION_STEPS) / _DIRECTION_STEPS
     z = 1.0 - np.abs(plane).sum(axis=1, keepdims=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import AnyArray
+from fleetmap.geometry import AnyArray, Array32
 from fleetmap.recordings.decoder_messages import with_messages
 from fleetmap.recordings.files import what_instead
 from fleetmap.recordings.limits import MAX_PIXELS
@@ -242,7 +242,7 @@ def is_mosaic(image: Image) -> bool:
     return max(means) - min(means) > _MOSAIC_SHARE * max(_LEAST_MOSAIC_GREY, sum(means) / 4)
 
 
-def decode_depth(stored: StoredImage) -> NDArray[np.float32]:
+def decode_depth(stored: StoredImage) -> Array32:
     """(H, W) metres, 0 where unknown. Whole numbers are millimetres, 0 and 65535 of them unknown; floats are metres."""
     pixels = _decode(stored)
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
@@ -273,7 +273,7 @@ def jpeg_image(image: AnyArray, *qualities: int, most_bytes: int = 0) -> StoredI
     return StoredImage("file", data)
 
 
-def depth_image(depth_m: NDArray[np.float32]) -> StoredImage:
+def depth_image(depth_m: Array32) -> StoredImage:
     """Store depth in metres (H, W) as 32FC1 row by row, bit for bit."""
     height, width = depth_m.shape
     return StoredImage("32FC1", np.ascontiguousarray(depth_m, "<f4").tobytes(), "", width, height, 4 * width)
@@ -343,7 +343,7 @@ def _check_rows(stored: StoredImage) -> int:
     return step if stored.height_px > 1 else row_bytes  # the length of a single row is not defined
 
 
-def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
+def _decode_inverse_depth(stored: StoredImage) -> Array32:
     """(H, W) metres, NaN where unknown. Source: compressed_depth_image_transport, whose 16 bits q mean a / (q - b) m, 0 unknown."""
     a, b = _inverse_depth_scale(stored)
     quantized = _decode_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))

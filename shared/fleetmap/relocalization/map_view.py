@@ -17,7 +17,7 @@ from fleetmap import core
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import Descriptors, Projected, match_by_projection, packed
 from fleetmap.features.orb import SCALE_FACTOR, Features
-from fleetmap.geometry import AnyArray, Array, Indices, Mask
+from fleetmap.geometry import AnyArray, Array, Array32, Indices, Mask
 from fleetmap.mapformat.tile import Tile
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
@@ -35,9 +35,9 @@ class ViewingCones(NamedTuple):
     """
 
     points_map: Array
-    directions_map: NDArray[np.float32]
-    half_angles_rad: NDArray[np.float32]
-    max_distances_m: NDArray[np.float32]
+    directions_map: Array32
+    half_angles_rad: Array32
+    max_distances_m: Array32
 
 
 class VisibleLandmarks(NamedTuple):
@@ -72,11 +72,7 @@ def pinhole_of(camera: StereoCamera) -> Array:
 
 
 def match_visible(
-    expected: VisibleLandmarks,
-    descriptors: NDArray[np.uint8],
-    windows_px: Array,
-    features: Features,
-    settings: FixSettings,
+    expected: VisibleLandmarks, descriptors: Descriptors, windows_px: Array, features: Features, settings: FixSettings
 ) -> Rows:
     """(V,) matching feature of each expected landmark with descriptors (V, 32), -1 for none, within windows_px (V,) of its pixel."""
     octaves = np.column_stack([np.floor(expected.octaves) - 2, np.ceil(expected.octaves) + 2]).astype(np.int64)
@@ -135,7 +131,7 @@ class CovisibleLandmarks:
 
     ids: NDArray[np.uint32]
     points_map: Array
-    descriptors: NDArray[np.uint8]
+    descriptors: Descriptors
     is_found: Mask
 
 
@@ -180,7 +176,7 @@ class MapView:
         unseen = _UNSEEN_LANDMARKS * (float(weights.mean()) if len(weights) else 1.0)
         self._place_weights = np.bincount(self._place_of_shown, self._shown_weights, minlength=len(counts)) + unseen
 
-    def similarities(self, descriptors: NDArray[np.uint8]) -> Array:
+    def similarities(self, descriptors: Descriptors) -> Array:
         """Return (K,) the share of each place's landmarks, weighted by word rarity, found among descriptors (N, 32).
 
         Not a symmetric similarity: a map within a budget holds a tenth of what a robot sees, and absence from it proves nothing. Each

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import Array, Mask, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, Array32, Mask, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import (
     LEAST_BASELINE_M,
     SIDEWAYS,
@@ -101,7 +101,7 @@ class RectifiedFrame:
     stamp_ns: int
     left: Image
     right: Image | None
-    disparity_px: NDArray[np.float32] | None
+    disparity_px: Array32 | None
     others: "tuple[OtherView | None, ...]" = ()
 
     def view(self, number: int) -> "RectifiedFrame | None":

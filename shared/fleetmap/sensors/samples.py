@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, interpolate_se3
+from fleetmap.geometry import Array, Array32, interpolate_se3
 
 Image = NDArray[np.uint8]
 Stamps = NDArray[np.int64]
@@ -65,7 +65,7 @@ class CameraFrame:
     stamp_ns: int
     left: Image
     right: Image | None = None
-    depth_m: NDArray[np.float32] | None = None
+    depth_m: Array32 | None = None
     others: "tuple[CameraFrame | None, ...]" = ()
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Indices
 from fleetsim.textures.painting import TEXEL_M
 
 MATERIAL_PLAIN, MATERIAL_FLOOR, MATERIAL_LAMP = 0, 1, 2
@@ -147,7 +147,7 @@ class FaceBuilder:
         )
 
 
-def _quads_of_boxes(box: Array, side_of: NDArray[np.int64]) -> Array:
+def _quads_of_boxes(box: Array, side_of: Indices) -> Array:
     half, cosine, sine = box[:, 3:6], box[:, 6], box[:, 7]
     local = _FACTORS[side_of] * half[:, None, :]
     turned = np.stack(

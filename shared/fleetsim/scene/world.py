@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, Array32
 from fleetsim.scene.building import HallMaker, Lamp
 from fleetsim.scene.faces import FaceBuilder, Faces
 from fleetsim.scene.layout import Layout, mix
@@ -101,7 +101,7 @@ _MOST_BAKED_CHUNKS, _MOST_BUILT_CHUNKS, _MOST_SCENES = 128, 256, 3
 _DECAL_CELLS = 64
 
 
-LitFaces = tuple[Faces, NDArray[np.float32]]
+LitFaces = tuple[Faces, Array32]
 """Faces with their baked light (groups, samples), before lamps are weighted."""
 
 
@@ -115,7 +115,7 @@ class Scene:
     quads: Array
     values: Array
     numbers: NDArray[np.int32]
-    light: NDArray[np.float32]
+    light: Array32
     ranges: NDArray[np.int32]
     bounds_m: Array
 

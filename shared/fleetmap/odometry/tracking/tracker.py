@@ -231,12 +231,7 @@ class Tracker:
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
 
     def _matched(
-        self,
-        old: _Remembered,
-        current: _Remembered,
-        usable: Ids,
-        guess: Array | None,
-        rotation_sigma_rad: float | None,
+        self, old: _Remembered, current: _Remembered, usable: Ids, guess: Array | None, rotation_sigma_rad: float | None
     ) -> tuple[Ids, Ids, PnpResult | None]:
         """Return matches of old features (M,) with usable current ones (M,), and the motion that explains them."""
         known = np.flatnonzero(np.isfinite(old.disparities))
