@@ -62,9 +62,7 @@ def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tu
         column.justify = "right"
     for name, path, factor, shown in rows:
         values = [value_at(report, path) for report in reports]
-        table.add_row(
-            name, *("not known" if v is None else shown.format(v if factor == 1 else v * factor) for v in values)
-        )
+        table.add_row(name, *("not known" if v is None else shown.format(v * factor) for v in values))
     return table
 
 

@@ -29,9 +29,7 @@ def list_operators(store: StoreFolder, json: Json = False) -> None:
 
     with open_store(store, read_only=True) as maps:
         found = Operators(maps).all()
-    shown = [
-        {name: getattr(row, name) for name in ("name", "role", "is_disabled", "sessions", "tokens")} for row in found
-    ]
+    shown = [{key: getattr(row, key) for key in ("name", "role", "is_disabled", "sessions", "tokens")} for row in found]
     rows = ((r.name, r.role, r.sessions, r.tokens, "disabled" if r.is_disabled else "") for r in found)
     print_result(shown, [table(("name", "role", "sessions", "tokens", ""), rows)], json=json)
 

@@ -238,9 +238,9 @@ class Console:
 
     async def _shown(self, request: Request, page: Page) -> Response:
         template, root, query, status = page.template, _root(request), request.query_params, 200
-        site, sites = query.get("site"), list[str]()
+        site, sites, maps = query.get("site"), list[str](), self.services.maps
         try:
-            growing, stored = await to_thread(page.under_way, site), await to_thread(self.services.maps.sites)
+            growing, stored = await to_thread(page.under_way, site), await to_thread(maps.sites)
             sites = sorted({*stored, *growing})
             if site is None and growing:
                 site = growing[0]
@@ -248,17 +248,13 @@ class Console:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 lost = await to_thread(self.services.robots.lost) if site is None else ()
-                site = await to_thread(
-                    self.services.maps.chosen_site, next((one for one in lost if one in stored), site)
-                )
+                site = await to_thread(maps.chosen_site, next((one for one in lost if one in stored), site))
             known = ("site", "find", *RANGE, *page.knows)
             if unknown := [name for name in query if name not in known]:
                 names = ", ".join(known)
                 raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
             context = PageContext(root, site, _zone(request), query)
-            found = {"context": context} | await to_thread(
-                lambda: page.fill(self.services, context, **request.path_params)
-            )
+            found = {"context": context} | await to_thread(page.fill, self.services, context, **request.path_params)
             site = str(found.get("site", site))  # a failure and a job have one, whatever the address names
         except FleetmapError as error:
             template, query, found = "problem.html", QueryParams(), {"words": str(error)}

@@ -221,9 +221,7 @@ def robots(services: Services, context: PageContext) -> dict[str, object]:
 
     shown = [row for row in rows if state in ("", row[0].words)]
     columns = {name: words for name, words in _COLUMNS.items() if name not in without}
-    states = [
-        (f"{words} ({n})", words == state, to(state="" if words == state else words)) for words, n in counts.items()
-    ]
+    states = [(f"{name} ({n})", name == state, to(state="" if name == state else name)) for name, n in counts.items()]
     return {
         "line": site_line(services.robots.look(context.site)),
         "states": states,

@@ -169,9 +169,7 @@ def build_draft(
             if parent is not None:
                 corrections = AreaCorrections.of(maps.areas(request.site), parent.manifest)
             if lacking := {path: each for path, each in admitted.items() if each.checked.lacks_pair}:
-                known = [
-                    maps.evidence(s.site, s.current_version) for s in maps.sites() if s.current_version is not None
-                ]
+                known = [maps.evidence(s.site, s.current_version) for s in maps.sites() if s.current_version]
                 yaws = pair_yaws(known, settings.noise.turn_sigmas)
                 admitted |= {p: replace(a, pair_yaw=yaws.get(a.checked.calibration.rig)) for p, a in lacking.items()}
             built = _survey(run, admitted, parent, corrections, JobProgress(maps, job.number))

@@ -29,7 +29,7 @@ from mapserver.quality import probes as probing
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, displaced, examine, trajectory_breaks
 from mapserver.quality.figures import BlindView, Evidence, RigEvidence, SurveyedViews, TrajectoryBreaks
-from mapserver.quality.probes import Probe, anywhere, place_xy, relocalized, spread
+from mapserver.quality.probes import Probe, anywhere, place_xy, probe_features, relocalized, spread
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.rig import frame_of_camera, used_cameras
@@ -123,9 +123,7 @@ def _read(
                 continue
             if (seen := frame_of_camera(frame, view)) is not None:
                 camera, body_from_cam = rectifier.mounted[view]
-                found.append(
-                    ProbedFrame(number, camera, body_from_cam, probing.probe_features(seen, camera, orb), view=view)
-                )
+                found.append(ProbedFrame(number, camera, body_from_cam, probe_features(seen, camera, orb), view=view))
     return found
 
 

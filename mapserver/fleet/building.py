@@ -53,9 +53,7 @@ def keep_areas(
             data = to_json(areas.geojson(site, alignment.frame))
         data = _dated(data, areas, before, actor, store.now_ns())
     if detail is None:
-        added, removed = (
-            sorted({*these.names} - {*others.names}) for these, others in ((areas, before), (before, areas))
-        )
+        added, removed = (sorted({*one.names} - {*other.names}) for one, other in ((areas, before), (before, areas)))
         words = [f"{done} {', '.join(names)}" for done, names in (("added", added), ("removed", removed)) if names]
         detail = "; ".join(words)[:2000] or "changed"
     store.keep_site_files(site, {AREAS: data}, detail, actor=actor, areas_tag=tag)

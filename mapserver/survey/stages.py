@@ -28,7 +28,7 @@ from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import Culled, assemble
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.loops import connected_components
+from mapserver.survey.loops import connected_components as connected
 from mapserver.survey.loops.connected_components import Component
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.odometry_pass import initial_state, poses_as_odometry, run_odometry
@@ -101,17 +101,15 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
         known = chain.matched, Tracks.of(state.landmarks, image_numbers(len(state.stamps_ns), len(rig)))
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     state = replace(state, landmarks=Landmarks.empty(), rig=rig)
-    chain = replace(chain, odometry=connected_components.without_doubted(chain.odometry, loops.doubted), state=state)
+    chain = replace(chain, odometry=connected.without_doubted(chain.odometry, loops.doubted), state=state)
     odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools, inputs.pair_yaw)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
-    components = connected_components.find_components(
-        state, connected_components.sigma_between(odometry), settings.join_sigma_m
-    )
-    state, odometry, loops = connected_components.only_kept(state, odometry, loops, components.kept)
+    components = connected.find_components(state, connected.sigma_between(odometry), settings.join_sigma_m)
+    state, odometry, loops = connected.only_kept(state, odometry, loops, components.kept)
     placed = place_frames(odometry, state, settings, stereo_yaws[0].correction_px, tools.executor)
     survey_map, rows, culled = assemble(state, odometry, placed, settings)
-    between = connected_components.between_kept(len(survey_map.trajectory), frames_of, components.kept)
+    between = connected.between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
     return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaws, every, placed.seen)
@@ -178,9 +176,7 @@ def close_loops(
         placed, terms = placed_by_priors(state.map_from_body, marginals, inputs.priors, base_from_body, odometry)
         marginals = GraphMarginals(placed, known)
         state = replace(state.moved(placed), priors=position_priors.learn_priors(marginals, terms))
-    groups = connected_components.find_groups(
-        state, connected_components.sigma_between(odometry), settings.join_sigma_m
-    )
+    groups = connected.find_groups(state, connected.sigma_between(odometry), settings.join_sigma_m)
     posed = _posed(odometry, replace(state, rig=rig_of(inputs.rectifier)))
     closer = LoopCloser(
         posed,
@@ -189,7 +185,7 @@ def close_loops(
         begun.matched,
         groups,
         tools.executor,
-        connected_components.find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
+        connected.find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
         measures_scale=not odometry.scale_known,
     )
     for i in range(len(posed.images)):

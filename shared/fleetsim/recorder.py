@@ -24,6 +24,7 @@ from fleetsim.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import LIGHT_STATES, World
+from fleetsim.sensors import RobotKind, measure_priors, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
 _SEEDS_PER_STOREY = 1 << 20
@@ -102,7 +103,7 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng([order.seed, order.day, zlib.crc32(robot.encode()), zlib.crc32(purpose.encode())])
 
 
-def drive(run: Run, kind: sensors.RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
+def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
     """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
     motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces, rides=len(run.storeys) > 1)
@@ -121,10 +122,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     kind = replace(run.kind, lens=order.lens or run.kind.lens, rig=order.rig, hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
-    nominal, true = (
-        sensors.nominal_calibration(kind),
-        sensors.true_calibration(kind, _generator(order, name, "mounting")),
-    )
+    nominal, true = (nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting")))
     motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
     rides_s = motion.rides_s if isinstance(motion, CarriedMotion) else []
     dark = [sensors.Fault("camera-dark", *ride_s) for ride_s in rides_s]
@@ -141,9 +139,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     ]
     renderer.above = list(zip([end_s for _, end_s in rides_s], above, strict=True))
     wheel = sensors.measure_wheels(motion, kind.body_height_m, _generator(order, name, "wheels"))
-    priors = sensors.measure_priors(
-        motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors")
-    )
+    priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(sensors.stamps_from_s(np.array([end_s]))[0])
     # Exact poses at every frame and each 20 ms
     grid_s = sensors.sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)

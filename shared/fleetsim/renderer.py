@@ -21,9 +21,7 @@ from fleetsim.sensors import OVER_EXPOSURE, Fault, FaultPlan
 _WIDEST_TANGENT = 2.5  # a single plane for rays further out than this (68 degrees) would be too large
 _DIFFERENCE_PX = 0.5
 _PLANE_SCALE = 0.85  # of the lens' focal length: shading is exact anyway, only edges are sampled a little more coarsely
-_TURNS = [
-    so3_exp(np.pi / 2 * np.array(axis)) for axis in ((0.0, 0.0, 0.0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
-]
+_TURNS = [so3_exp(np.pi / 2 * np.array(axis)) for axis in ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from mapserver.plugins.dense_maps import surfel_map
 from mapserver.plugins.dense_maps.dense_stereo import STEP_PX
 from mapserver.plugins.dense_maps.exposure import Exposure, Sample, estimate_exposure, squared_tangent
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT, OCCUPIED
-from mapserver.plugins.dense_maps.surfel_map import EDGE_M, LEVELS, MAX_RANGE_M, TILE_SIZE_M, Surfels, SurfelTiles
+from mapserver.plugins.dense_maps.surfel_map import EDGE_M, MAX_RANGE_M, NO_FALLOFF, TILE_SIZE_M, Surfels, SurfelTiles
 from mapserver.plugins.dense_maps.survey_grid import DepthView
 from mapserver.survey.state import ImageStore
 
@@ -149,9 +149,7 @@ class SurfelGrower:
         old = self.surfels.surfels(place)
         order, blocks = _blocks(old.points_map)
         old = old[order]
-        sums = self._weighed(
-            old, blocks, images, Exposure(np.zeros(len(self._looks)), np.zeros(len(surfel_map.NO_FALLOFF)))
-        )
+        sums = self._weighed(old, blocks, images, Exposure(np.zeros(len(self._looks)), np.zeros(len(NO_FALLOFF))))
         old = old[HIT * sums[:, 0] - sums[:, 1] > -AGAINST]
         kept: list[Any] = self._images.keep([old.points_map, old.normals, old.levels, old.greys])
         self._images.release()
@@ -242,7 +240,7 @@ def _blocks(points_map: Array32) -> tuple[Indices, list[slice]]:
 def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> Mask:
     """Return (N,) True if `other` has the same place, or the one in front of or behind it, at least `finer_by` levels finer."""
     known = np.zeros(len(surfels), bool)
-    for level in range(LEVELS):
+    for level in range(surfel_map.LEVELS):
         mine, finer = np.flatnonzero(surfels.levels == level), other.levels + finer_by <= level
         held, counts = np.unique(_keys(other.points_map[finer], level), return_counts=True)
         held = held[counts >= (_MIN_FINER if finer_by else 1)]
