@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.matching import packed
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.geometry import Array, Indices, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 
 _MAX_LOOKS, _ALL_LOOKS = 64, (1 << 64) - 1  # in the history: about 20 m of travel
@@ -122,7 +122,7 @@ class ObservationHistory:
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
         self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
 
-    def _keep(self, rows: NDArray[np.int64]) -> None:
+    def _keep(self, rows: Indices) -> None:
         self.ids, self.points_odom, self.descriptors = self.ids[rows], self.points_odom[rows], self.descriptors[rows]
         self.expected, self.found = self.expected[rows], self.found[rows]
 

@@ -199,7 +199,7 @@ def rotation_between_vectors(source: Array, target: Array) -> Array:
     return so3_exp(np.arctan2(sine, cosine) * axis / sine)
 
 
-def inside_rings(points: Array, rings: Iterable[Array]) -> NDArray[np.bool_]:
+def inside_rings(points: Array, rings: Iterable[Array]) -> Mask:
     """(N,) True for points (N, 2) inside, by the even-odd rule over all rings: (V, 2) corners, the first not repeated at the end."""
     inside = np.zeros(len(points), bool)
     x, y = points[:, :1], points[:, 1:]
@@ -211,7 +211,7 @@ def inside_rings(points: Array, rings: Iterable[Array]) -> NDArray[np.bool_]:
     return inside
 
 
-def inside_any(points: AnyArray, polygons: Iterable[Rings]) -> NDArray[np.bool_]:
+def inside_any(points: AnyArray, polygons: Iterable[Rings]) -> Mask:
     """(N,) True for points (N, 2) or (N, 3) inside one polygon or more, at any height; each has its own holes."""
     flat, inside = points[:, :2].astype(np.float64), np.zeros(len(points), bool)
     for rings in polygons:

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.failure_definition import radius_95_m
-from fleetmap.geometry import Array, se3_inverse, so3_log, transform_points
+from fleetmap.geometry import Array, Mask, se3_inverse, so3_log, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
@@ -128,7 +127,7 @@ class Prior:
         is_telling = not self.is_told and order[0].speaks_against_others(self.settings)  # as against a confirmed pose
         return has_more and (is_telling or found.is_supported(order[0])) and not found.may_be_lookalike(order[0])
 
-    def is_near(self, positions_map: Array, floor: str = "") -> NDArray[np.bool_]:
+    def is_near(self, positions_map: Array, floor: str = "") -> Mask:
         """Return flags (N,) of the positions (N, 3) on one of the prior's floors from which the robot may have its present view."""
         prior_from_map = self.floors[floor]
         if prior_from_map is not None:

@@ -4,9 +4,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Indices, se3_inverse
 from fleetmap.sensors.samples import PAUSE_NS
 
 
@@ -43,7 +42,7 @@ class OdometryEstimate:
     velocity_odom_mps: Array = field(default_factory=lambda: np.zeros(3))
     gyro_bias_radps: Array = field(default_factory=lambda: np.zeros(3))
     accel_bias_mps2: Array = field(default_factory=lambda: np.zeros(3))
-    track_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    track_ids: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
     scene_depth_m: float = 5.0
     inlier_share: float = 1.0
     after_gap: bool = False

@@ -1,10 +1,9 @@
 """Checks of the odometry: a wrong IMU, a diverged filter, standstill."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, rotation_angle_rad
+from fleetmap.geometry import Array, Indices, rotation_angle_rad
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # surplus of disagreeing over agreeing frames, at which the IMU is abandoned
@@ -59,9 +58,9 @@ class ZeroVelocityDetector:
 
     def __init__(self, window_s: float, limit_px: float) -> None:
         self._window_ns, self._limit_px = int(window_s * 1e9), limit_px
-        self._images: list[tuple[int, NDArray[np.int64], Array]] = []
+        self._images: list[tuple[int, Indices, Array]] = []
 
-    def since(self, now_ns: int, ids: NDArray[np.int64], pixels: Array) -> tuple[int, int] | None:
+    def since(self, now_ns: int, ids: Indices, pixels: Array) -> tuple[int, int] | None:
         """Start of the standstill of the image, at least a window ago, and stamp of the previous image; None if it moved.
 
         ids (N,), pixels (N, 3) of the points seen at now_ns, later than any before.

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, midpoints, se3
+from fleetmap.geometry import Array, Mask, midpoints, se3
 from fleetmap.sensors.rectification import StereoCamera
 
 _INLIER_PX, _SCORED_PX = 1.0, 3.0  # of RANSAC, and of the score
@@ -22,7 +21,7 @@ class TwoView:
 
     b_from_a: Array
     points_a: Array
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     parallax_rad: float
 
 

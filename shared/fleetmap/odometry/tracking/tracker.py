@@ -12,7 +12,7 @@ from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.patch_align import Patches, Pyramid, half_pyramid, refine_matches
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
-from fleetmap.geometry import Array, transform_points
+from fleetmap.geometry import Array, Mask, transform_points
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.pnp.pnp import REFINEMENT, Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -207,7 +207,7 @@ class Tracker:
         self,
         old: _Remembered,
         current: _Remembered,
-        free: NDArray[np.bool_],
+        free: Mask,
         guess: Array | None,
         rotation_sigma_rad: float | None,
     ) -> Earlier | None:
