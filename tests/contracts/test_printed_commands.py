@@ -18,7 +18,7 @@ def _texts(tree: ast.AST) -> Iterator[tuple[int, str]]:
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             continue
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in {"Option", "Argument"}:
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in {"Option", "Argument"}:
             continue
         if isinstance(node, ast.JoinedStr):
             parts = (str(part.value) if isinstance(part, ast.Constant) else "1" for part in node.values)

@@ -6,7 +6,7 @@ A right is given by those who have it: a token that manages operators cannot mak
 from functools import partial
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, prompt
 
 from fleetmap.errors import StateError
 from mapserver.api.operations.operation import Caller, Done, operation
@@ -14,19 +14,19 @@ from mapserver.operators.roles import OPERATOR_PATTERN, SCOPES, Role, Scope
 
 Name = Annotated[
     str,
-    typer.Argument(metavar="NAME", help="Name of the operator, or of a program."),
+    Argument(metavar="NAME", help="Name of the operator, or of a program."),
     {"pattern": OPERATOR_PATTERN, "examples": ["bob"]},
 ]
-NewRole = Annotated[Role, typer.Option(help="viewer: reads; operator: changes versions too; admin: everything.")]
-RoleArgument = Annotated[Role, typer.Argument(metavar="ROLE", help="viewer, operator or admin.")]
+NewRole = Annotated[Role, Option(help="viewer: reads; operator: changes versions too; admin: everything.")]
+RoleArgument = Annotated[Role, Argument(metavar="ROLE", help="viewer, operator or admin.")]
 Scopes = Annotated[
     list[Scope],
-    typer.Option("--scope", metavar="SCOPE", help="What it may; repeat it."),
+    Option("--scope", metavar="SCOPE", help="What it may; repeat it."),
     {"min_length": 1, "max_length": len(Scope)},
 ]
-Days = Annotated[float, typer.Option(min=0.01, max=400, help="Days after which it ends.")]
-Number = Annotated[str, typer.Argument(metavar="NUMBER", help="Number of the token.")]
-Ask = Annotated[bool, typer.Option("--ask", help="Ask for a password instead of making one.")]
+Days = Annotated[float, Option(min=0.01, max=400, help="Days after which it ends.")]
+Number = Annotated[str, Argument(metavar="NUMBER", help="Number of the token.")]
+Ask = Annotated[bool, Option("--ask", help="Ask for a password instead of making one.")]
 of_people = partial(operation, needs=Scope.OPERATORS)
 
 
@@ -85,7 +85,7 @@ def revoke_token(caller: Caller, token: Number) -> Done:
 
 def _chosen(*, ask: bool) -> str | None:
     """Ask for a password; None to have one generated."""
-    return typer.prompt("password", hide_input=True, confirmation_prompt=True) if ask else None
+    return prompt("password", hide_input=True, confirmation_prompt=True) if ask else None
 
 
 def _shown(chosen: str | None, made: str) -> str:
