@@ -27,8 +27,7 @@ def test_a_map_in_five_lines(room_ride: Path, tmp_path: Path) -> None:
         draft.publish()
     draft.publish(trust_calibration=True, actor=Actor("ada", "the rig is known"))
     with open_store(str(tmp_path / "maps")) as maps:
-        current = maps.current("hall")
-        assert current.version == 1
+        assert maps.current("hall").version == 1
     arrays = open_map(tmp_path / "maps", "hall")
     assert arrays.version == 1
     assert arrays.points_map.shape == (len(arrays.landmark_ids), 3)

@@ -165,8 +165,7 @@ def run_odometry(
     odometry = odometry_of(session, settings or OdometrySettings(), calibration)
     estimates, last_ns = [], 0
     for frame in range(len(session) if frames is None else min(frames, len(session))):
-        stamp_ns = session.stamps_ns[frame]
-        until_ns = stamp_ns + _LEAD_NS
+        until_ns = session.stamps_ns[frame] + _LEAD_NS
         odometry.handle_imu(session.session.imu.between(last_ns, until_ns))
         odometry.handle_wheel(wheel_between(session.session.wheel, last_ns, until_ns))
         last_ns = until_ns

@@ -33,8 +33,7 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     init_here(store)
     register = RobotRegister(store)
     register.authorities.init(["127.0.0.1"], None, None)
-    names = [f"r{number}" for number in range(count)]
-    register.enrol(SITE, names, ENDPOINT)
+    register.enrol(SITE, [f"r{number}" for number in range(count)], ENDPOINT)
     holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
     before_mb = resident_mb()
     bus = Bus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access())

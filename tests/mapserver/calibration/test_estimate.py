@@ -122,8 +122,7 @@ def test_a_short_stretch_says_nothing() -> None:
 
 
 def test_wheels_alone_give_the_baseline_as_well_as_they_know_themselves(loop: Stretch) -> None:
-    found = estimated(loop, {P.BASELINE: 0.05}, inertial=False)
-    baseline = found.get(P.BASELINE)
+    baseline = estimated(loop, {P.BASELINE: 0.05}, inertial=False).get(P.BASELINE)
     assert baseline.is_judged
     assert 0.004 < baseline.sigma < 0.008
     assert abs(baseline.estimate - (1.0 / 0.95 - 1.0)) < 3.0 * baseline.sigma

@@ -231,8 +231,7 @@ def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:
     parts = stretches(rows, 350_000_000_000)
     drawn = [(line.tone, line.points[0][0] - 1.0, line.points[-1][0] - 1.0) for line in way(rows, parts)]
     assert drawn == [("good", 0, 10), ("good", 311, 312), ("good", 330, 340), ("bad", 10, 20), ("bad", 300, 310)]
-    standing = [replace(traced(n, "TRACKING"), x_map_m=0.1) for n in range(9)]
-    assert way(standing, parts) == []
+    assert way([replace(traced(n, "TRACKING"), x_map_m=0.1) for n in range(9)], parts) == []
 
 
 def test_a_robot_that_wavers_is_drawn_in_few_parts() -> None:

@@ -123,8 +123,7 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     week = page.locator(".notice", has_text="This week: Aisle 2 got worse; in 1 of 4 too little was driven")
     assert box_of(week)["y"] < 600, "without scrolling"
     operator.click(page.get_by_role("link", name="Area by area"))
-    heading = page.get_by_role("heading", name="What got worse this week")
-    expect(heading).to_be_in_viewport()
+    expect(page.get_by_role("heading", name="What got worse this week")).to_be_in_viewport()
     table = page.get_by_role("table", name="What got worse this week")
     expect(table.get_by_role("row").nth(1)).to_contain_text(re.compile(r"^aisle 2\s*worse\S+ to \S+ times"))
     expect(table.get_by_role("row", name=re.compile("^dock"))).to_contain_text("too little driving to say")

@@ -94,8 +94,7 @@ def test_an_error_far_beyond_a_coarse_sigma_is_found_and_not_corrected() -> None
 
 
 def test_a_shifted_principal_point_that_looks_like_a_turn_is_no_turn() -> None:
-    turned = estimate(camera_imu_y=-0.0137, principal_x=-5.4)
-    assert P.CAMERA_IMU_Y.value not in verdicts(turned)
+    assert P.CAMERA_IMU_Y.value not in verdicts(estimate(camera_imu_y=-0.0137, principal_x=-5.4))
     assert verdicts(estimate(camera_imu_y=-0.0137))[P.CAMERA_IMU_Y.value] is Verdict.WARN
 
 
@@ -130,8 +129,7 @@ def test_only_what_the_frames_lack_is_not_judged(error: FleetmapError) -> None:
         with pytest.raises(StoreError, match="the disk is full"):
             measure_calibration(recording, follow)
     else:
-        found = measure_calibration(recording, follow)
-        assert "it is dark" in found.findings[0].sentence
+        assert "it is dark" in measure_calibration(recording, follow).findings[0].sentence
 
 
 def test_keyframes_alone_are_not_judged() -> None:

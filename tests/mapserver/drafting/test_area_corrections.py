@@ -108,8 +108,7 @@ def test_a_version_knows_its_corrections() -> None:
     areas = Areas.of([area(FORGET, (0, 0), (1, 1)), area(FREEZE, (5, 5), (6, 6))])
     assert [one.name for one in AreaCorrections.of(areas, manifest()).due] == ["forget (0, 0)"]
     configuration = AreaCorrections(areas.areas).configuration("lab")
-    kept_areas = corrections_of(manifest(**configuration))
-    assert kept_areas.geojson("lab") == areas.geojson("lab")
+    assert corrections_of(manifest(**configuration)).geojson("lab") == areas.geojson("lab")
     assert AreaCorrections.of(areas, manifest(**configuration)).due == []
     again = Areas.of([area(FORGET, (0, 0), (1, 1), NOW_NS + 1)])
     assert AreaCorrections.of(again, manifest(**configuration)).due == list(again.areas)

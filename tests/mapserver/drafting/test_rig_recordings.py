@@ -69,8 +69,7 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
     rows = [(0, single.rectify(frames[0]))]
     (seen,) = next(make_keyframes(rows, used_cameras(single), SurveySettings(), SurveyTools())).others
     assert len(seen.features) > 0 and np.isnan(seen.disparities).all()
-    one = replace(calibration, cameras=calibration.cameras[1:])
-    assert len(used_cameras(Rectifier(one))) == 1
+    assert len(used_cameras(Rectifier(replace(calibration, cameras=calibration.cameras[1:])))) == 1
     rows = [(0, frame), *((n, replace(frame, others=(None,))) for n in (1, 2))]
     first, alone, again = make_keyframes(rows, cameras, SurveySettings(), SurveyTools())
     assert alone.others[0].image_number == again.others[0].image_number, "one picture of nothing is enough"

@@ -117,8 +117,7 @@ def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
         assert low.lifts_at(np.array([2.0, 2.0]), 0.0) == {"A"}
         assert not low.lifts_at(np.array([3.4, 2.0]), 0.3)
         assert low.lifts_at(np.array([3.4, 2.0]), 0.5) == {"A"}
-        kept = store.areas("hall-1")
-        keep_areas(store, "hall-1", to_json(kept.geojson("hall-1")), "", NOBODY)
+        keep_areas(store, "hall-1", to_json(store.areas("hall-1").geojson("hall-1")), "", NOBODY)
         assert store.areas("hall-1").areas[0].lift == "A", "it survives a change of the areas by a page"
 
 

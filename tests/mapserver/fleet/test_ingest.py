@@ -119,8 +119,7 @@ def test_the_store_counts_what_the_robots_know(site: Site) -> None:
     assert found.failures.robot_days == known.driving_s["site", ""] / 57600
     assert found.landmarks_seen_share == pytest.approx(0.7)
     assert found.first_fix_mean_s == 1.5
-    hours = site.store.fleet.hours("lab", "site")
-    assert sorted(hours) == [490_000]
+    assert sorted(site.store.fleet.hours("lab", "site")) == [490_000]
     assert len(site.store.fleet.failures(FailureFilter(site="lab"))) == known.reports
 
 
@@ -239,8 +238,7 @@ def test_names_that_robots_make_up_do_not_make_keys(site: Site) -> None:
 
 
 def test_a_trace_shows_the_way_and_every_change(site: Site) -> None:
-    robots = made(site, 1, rate_per_robot_day=3000.0)
-    site.run(robots, 300)
+    site.run(made(site, 1, rate_per_robot_day=3000.0), 300)
     trace = site.store.fleet.trace("lab", "r0")
     assert site.known.failures["robot", "r0"] >= 3
     assert {row.status for row in trace} == {"TRACKING", "LOST"}

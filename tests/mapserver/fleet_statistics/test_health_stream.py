@@ -106,8 +106,7 @@ def test_silence_is_not_observed() -> None:
 
 def test_a_status_without_frames_is_of_the_past() -> None:
     """A camera that is torn off: the last status was TRACKING, and is repeated."""
-    reports = [health(min(n, 10), wall_ns=n * NS, speed_mps=1.0) for n in range(31)]
-    found = total(reports)
+    found = total([health(min(n, 10), wall_ns=n * NS, speed_mps=1.0) for n in range(31)])
     assert (found.observed_ms, found.after_fix_ms) == (30_000, 30_000)
     assert found.localised_ms == found.usable_ms == 12_000  # two seconds of silence are not yet one
     assert found.blind_seen == 1

@@ -69,8 +69,7 @@ def test_areas_of_the_building_come_into_the_map() -> None:
     areas = read_areas(collection(feature("gate", box(8, -20, 10, -15)), frame="building"), frame)
     assert areas.at(2.5, 1.0) == "gate"  # five metres up in the building are along x of the map
     assert areas.at(9.0, -18.0) is None
-    again = read_areas(json.dumps(areas.geojson("hall")).encode(), None)
-    assert again.at(2.5, 1.0) == "gate"
+    assert read_areas(json.dumps(areas.geojson("hall")).encode(), None).at(2.5, 1.0) == "gate"
 
 
 @pytest.mark.parametrize(

@@ -211,14 +211,12 @@ def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if
     assert found.given_more > 0
     assert found.without_fix == []
     kept = looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
-    unmapped = observed(survey_map, kept)
-    _, found = chooser._replace(survey_map=unmapped).choose(views)
+    _, found = chooser._replace(survey_map=observed(survey_map, kept)).choose(views)
     assert found.given_more == 0
     at_second = [view for view in views if view.probe.map_from_cam[:3, 2] @ facing() < 0.0]
     assert len(found.without_fix) == len(at_second)
     assert found.without_fix[-1].path_m == round(at_second[-1].path_m, 1) > 3.0
-    evidence = Evidence(views=found)
-    said = judge(manifest(tiles, 2), None, GateSettings(), evidence)
+    said = judge(manifest(tiles, 2), None, GateSettings(), Evidence(views=found))
     assert f"{len(at_second)} of {len(views)} frames" in said.report["warnings"][0]
     assert "m into its recording" in said.report["warnings"][0]
 
@@ -256,8 +254,7 @@ def test_nights_that_changed_little_do_not_hold_the_next_one() -> None:
 def test_what_the_current_version_does_not_find_either_is_no_loss() -> None:
     survey_map = sound()[0].map
     kept = ~looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
-    half = observed(survey_map, kept)
-    evidence = beside_itself(survey_map, tiles_from_survey(half))
+    evidence = beside_itself(survey_map, tiles_from_survey(observed(survey_map, kept)))
     assert evidence.last_version.draft.frames < len(survey_map.map_from_body)
     assert evidence.last_version.draft.localised_share == 1.0
 
@@ -266,8 +263,7 @@ def test_a_draft_that_lost_a_third_of_its_landmarks_is_refused() -> None:
     survey_map = sound()[0].map
     lost = np.random.default_rng(1).random(len(survey_map.landmark_ids)) < 1 / 3
     kept = ~lost[survey_map.obs_landmark]
-    fewer = observed(survey_map, kept)
-    said, evidence = verdict(fewer)
+    said, evidence = verdict(observed(survey_map, kept))
     assert evidence.last_version.inliers_share < 0.8
     assert any("number of landmarks" in reason for reason in said.reasons)
     assert any("matches per frame" in reason for reason in said.reasons)
@@ -349,11 +345,9 @@ def test_a_torn_trajectory_is_found_and_drift_is_not() -> None:
     assert (found.breaks, found.worst_m) == (2, 0.5)
     said = judge(manifest(tiles_from_survey(sound()[0].map), 1), None, GateSettings(), Evidence(motion=found))
     assert any("torn in 2 places" in reason for reason in said.reasons)
-    fine = trajectory_breaks(stamps, drifted, odom, covariances, tracked)
-    assert fine.breaks == 0
+    assert trajectory_breaks(stamps, drifted, odom, covariances, tracked).breaks == 0
     tracked[[150, 250]] = False  # odometry itself says that it does not know
-    left = trajectory_breaks(stamps, torn, odom, covariances, tracked)
-    assert left.breaks == 0
+    assert trajectory_breaks(stamps, torn, odom, covariances, tracked).breaks == 0
 
 
 STRAIGHT = RigEvidence("a1", not_judged={"pair geometry": "drive curves"})

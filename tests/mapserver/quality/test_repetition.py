@@ -36,8 +36,7 @@ def measured(seen: Aisle) -> Repetition | None:
 
 @pytest.mark.parametrize("bay_m", [1.8, 2.7, 3.6])
 def test_racks_repeat_at_their_bays(bay_m: float) -> None:
-    found = measured(racks(bay_m))
-    assert found.step_m == pytest.approx(bay_m, rel=0.1)
+    assert measured(racks(bay_m)).step_m == pytest.approx(bay_m, rel=0.1)
 
 
 def test_a_fix_that_is_off_by_less_than_an_alias_is_no_alias() -> None:

@@ -46,8 +46,7 @@ def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_
 
 def test_a_bad_version_is_not_gone_back_to(store: MapStore, tmp_path: Path) -> None:
     publish_samples(store, 2)
-    tile = store.manifest("lab", 1).tiles[0].sha256
-    (tmp_path / "store" / blob_path(tile)).unlink()
+    (tmp_path / "store" / blob_path(store.manifest("lab", 1).tiles[0].sha256)).unlink()
     for go_back in (lambda: releases.roll_back(store, "lab"), lambda: releases.promote(store, "lab", 1)):
         with pytest.raises(StoreError, match="incomplete"):
             go_back()

@@ -217,8 +217,7 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(
         own.write_bytes(renewed(bundle))
         clock.now_ns += 2 * DAY_NS
         bus, guard = prepare_bus(store, "tls/127.0.0.1:0", insecure=False)
-        service = BusService(store, Fleet(store), bus, lambda *_: None, guard)
-        stack.callback(service.close)
+        stack.callback(BusService(store, Fleet(store), bus, lambda *_: None, guard).close)
         stack.enter_context(bus)
         bus.open()
         robot = stack.enter_context(Bus(bus.endpoint, tls=TlsFiles(servers, own)).open())

@@ -75,8 +75,7 @@ def test_a_robot_takes_the_grid_with_its_version_and_then_what_changed(
     assert (second.cells == 100).sum() < (first.cells == 100).sum()
     # A grid that cannot be had costs the robot nothing else.
     save_grid_draft(world.store, 3)
-    draft = world.store.manifest("lab", 5)
-    index = str(draft.report["grid"]["sha256"])
+    index = str(world.store.manifest("lab", 5).report["grid"]["sha256"])
     with pytest.raises(LinkError, match="no published bytes"):
         world.link.blob(index, 10**6)
     releases.publish(world.store, "lab", actor=Actor("ada", "a test"), force=True)

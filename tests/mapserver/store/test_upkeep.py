@@ -94,8 +94,7 @@ def test_leftovers_are_removed(store: MapStore) -> None:
     publish_samples(store, 1)
     is_folder = read_places(store.folder).content is None
     if is_folder:
-        folder = next((store.folder / "blobs").iterdir())
-        (folder / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
+        (next((store.folder / "blobs").iterdir()) / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
     store._blobs.put(b"nobody mentions this")
     foreign = ["blobs/README", "others/README"] if is_folder else ["blobs/README", "blobs/ab/README", "others/README"]
     for path in foreign:

@@ -128,7 +128,6 @@ def test_processes_elsewhere_send_their_pictures(tmp_path: Path) -> None:
 
 def test_a_segment_that_cannot_start_is_surveyed_with_the_one_before() -> None:
     cut_s = alone().odometry.cuts[0].after_s
-    done = surveyed(SEGMENTS, dark=(cut_s - 0.3, cut_s + 0.2))
-    first, second = done.odometry.cuts
+    first, second = surveyed(SEGMENTS, dark=(cut_s - 0.3, cut_s + 0.2)).odometry.cuts
     assert first.refused is not None
     assert second.refused is None

@@ -211,8 +211,7 @@ def test_a_key_that_is_elsewhere_signs_nothing_until_the_site_is_admitted_again(
 def test_row_33_an_archive_swapped_in_the_database(store: MapStore) -> None:
     """The next map would be built on it. A list named the right one, and none is signed that names the other."""
     check_base(store, store.current("lab"))
-    other = store._blobs.put(b"another survey")
-    set_archive(store, other)
+    set_archive(store, store._blobs.put(b"another survey"))
     assert store.archive("lab", 1) == b"another survey"  # the control: the store believes its table
     for act in (lambda: check_base(store, store.current("lab")), lambda: update_lists(store)):
         with pytest.raises(StateError, match="names other bytes for version 1"):
@@ -253,8 +252,7 @@ def test_beyond_loopback_a_store_must_be_signed_first(tmp_path: Path, clock: Clo
 
 def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapStore) -> None:
     publish_samples(store, 1, first=5, site="yard")
-    found = SignedLists(store.folder).served("yard")
-    assert found.state("current").about.version == 1
+    assert SignedLists(store.folder).served("yard").state("current").about.version == 1
     assert len(trust_status(store).risks) == 3
 
 

@@ -24,8 +24,7 @@ def s3_server(folder: Path) -> Iterator[str]:
     command += ["--auth-key", key, "--config", str(folder / "config")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
-        found = next(filter(None, (re.search(r"http://[^/\]]+", line) for line in process.stderr)))
-        yield found[0]
+        yield next(filter(None, (re.search(r"http://[^/\]]+", line) for line in process.stderr)))[0]
     finally:
         process.terminate()
         process.wait(timeout=30)

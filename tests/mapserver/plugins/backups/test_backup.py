@@ -95,8 +95,7 @@ def test_garbage_that_is_collected_meanwhile_is_no_fault(
         if done == 1:
             store.collect_garbage(Retention(keep_drafts=0, keep_days=0.0))
 
-    report = back_up(store, target, progress=collect)
-    assert report.missing == ()
+    assert back_up(store, target, progress=collect).missing == ()
     assert target.read()[1].versions == 2
     restore(target, tmp_path / "new", ADA)
 
@@ -154,8 +153,7 @@ def test_keys_come_back_with_the_right_identity_alone(store: MapStore, tmp_path:
     identity, other = pyrage.x25519.Identity.generate(), pyrage.x25519.Identity.generate()
     (tmp_path / "key").write_text(f"# made by age-keygen\n{identity}\n")
     (tmp_path / "other").write_text(f"{other}\n")
-    report = back_up(store, target, recipient=recipient_of(str(identity.to_public())))
-    assert report.has_keys
+    assert back_up(store, target, recipient=recipient_of(str(identity.to_public()))).has_keys
     secret = (store.folder / "keys" / "online.pem").read_bytes()
     assert not any(secret in path.read_bytes() for path in (tmp_path / "backups").rglob("*") if path.is_file())
     with pytest.raises(UsageError, match="not the key"):
@@ -203,8 +201,7 @@ def test_a_clock_that_was_ahead_hides_no_later_snapshot(
     back_up(store, target, keep=1)
     clock.now_ns -= 400 * DAY_NS
     save_sample_draft(store, seed=7)
-    report = back_up(store, target, keep=1)
-    assert target.snapshots() == [report.snapshot]
+    assert target.snapshots() == [back_up(store, target, keep=1).snapshot]
     assert restore(target, tmp_path / "new", ADA).versions == 3
 
 

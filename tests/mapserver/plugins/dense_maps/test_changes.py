@@ -26,8 +26,7 @@ def with_board(session: MappedSession) -> MappedSession:
         cam_from_map = se3_inverse(session.map_from_body[number] @ BODY_FROM_CAM0)
         corners = BOX_M + 0.25 * np.array([[i, 0.0, j] for i in (-1, 1) for j in (-1, 1)])
         points = corners @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
-        camera = session.survey.state.rig.camera
-        pixels = camera.pixel_from_point(points)
+        pixels = session.survey.state.rig.camera.pixel_from_point(points)
         (left, top), (right, bottom) = pixels[:, :2].min(axis=0).astype(int), pixels[:, :2].max(axis=0).astype(int)
         shown = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
         grey, disparity = seen.frame.left.copy(), seen.frame.disparity_px.copy()
@@ -57,8 +56,7 @@ def test_what_came_and_what_went_is_found_where_it_stood(rooms: tuple[Surfels, S
     for (before, after), kind in (((bare, board), APPEARED), ((board, bare_again), VANISHED)):
         changes = changes_between(site(before), site(after))
         assert [patch.kind for patch in changes.patches] == [kind]
-        box = changes.patches[0].box_map
-        np.testing.assert_allclose(box.mean(axis=0), BOX_M, atol=0.12)
+        np.testing.assert_allclose(changes.patches[0].box_map.mean(axis=0), BOX_M, atol=0.12)
         assert 0.5 * 0.25 < changes.area_m2(kind) < 1.5 * 0.25
         rows, columns = np.nonzero(changes.layers[kind])
         places = changes.corner_m + (np.column_stack([columns, rows]) + 0.5) * 0.1

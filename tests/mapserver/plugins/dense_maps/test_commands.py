@@ -152,8 +152,7 @@ def test_another_reader_finds_the_wall(run, walled, tmp_path: Path) -> None:
     # The thin axis of each Gaussian is the wall's normal: z of its rotation, up to the sign.
     turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     rotations = np.stack([vertices[f"rot_{i}"] for i in range(4)], axis=1)
-    wanted = quat_wxyz_from_rotation(turned)
-    assert np.abs(rotations @ wanted).min() == pytest.approx(1.0, abs=1e-4)
+    assert np.abs(rotations @ quat_wxyz_from_rotation(turned)).min() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_what_changed_is_written_as_a_plan_and_as_geojson(run, walled, store: MapStore, tmp_path: Path) -> None:

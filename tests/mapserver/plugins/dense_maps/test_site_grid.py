@@ -174,8 +174,7 @@ def test_nothing_is_free_beside_the_edge_of_a_thing() -> None:
 
 
 def test_a_night_that_sees_the_same_changes_nothing() -> None:
-    views = wall_views(5.02, np.arange(0.0, 3.5, 0.25))
-    first = updated(views)
+    first = updated(wall_views(5.02, np.arange(0.0, 3.5, 0.25)))
     second = updated(wall_views(5.02, np.arange(0.0, 3.5, 0.25), before=first))
     changed = sum((first[place] != second[place]).any(axis=-1).sum() for place in first)
     assert changed < 0.02 * sum((cells != 0).any(axis=-1).sum() for cells in first.values())

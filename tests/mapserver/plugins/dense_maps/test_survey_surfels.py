@@ -179,6 +179,5 @@ def test_of_many_drives_along_a_way_the_last_ones_are_matched() -> None:
     counted = _Counted()
     grow({"counted": counted}, [session_at([away, *lap * 9], has_depth=True)], StereoSettings())
     assert counted.frames == [0, *range(1 + len(lap) * (9 - FREE_VIEWS), 1 + len(lap) * 9)]
-    once = session_at(lap, has_depth=True)
-    grow({"counted": counted}, [once], StereoSettings())
+    grow({"counted": counted}, [session_at(lap, has_depth=True)], StereoSettings())
     assert counted.frames == list(range(len(lap)))

@@ -69,8 +69,7 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(finished: Finished) ->
 
 def test_its_phases_are_told_in_order_and_end_with_the_draft(finished: Finished) -> None:
     (figures, built), told, _ = finished
-    phases = list(dict.fromkeys(state.phase for state in told))
-    assert phases[-2:] == ["adjusting", "stored"]
+    assert list(dict.fromkeys(state.phase for state in told))[-2:] == ["adjusting", "stored"]
     assert (told[-1].version, told[-1].words) == (1, built.sentence)
     assert "live: 24 frames" in figures.words()
 
@@ -124,8 +123,7 @@ def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: P
     """A recording takes the place of the sensors: what comes out must hold all that went in."""
     source = RecordingSource(open_recording(recording), speed=0)
     request = BuildRequest((tmp_path / "drive.mcap",), "lab", tmp_path / "maps")
-    drive = SensorDrive(request, source, Topics())
-    figures, _ = run_live(drive, [], lambda: False, QUIET)
+    figures, _ = run_live(SensorDrive(request, source, Topics()), [], lambda: False, QUIET)
     assert (figures.state.frames, figures.dropped) == (FRAMES, 0)
     with open_recording(recording) as given, open_recording(tmp_path / "drive.mcap") as kept:
         assert kept.frame_stamps_ns.tolist() == given.frame_stamps_ns.tolist()

@@ -563,8 +563,7 @@ def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
         spend(hall)
     monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))
     assert "version 1 published" in spend(hall)
-    report = last_report(hall / "store", "hall")
-    assert report["resumes"] == [1]
+    assert last_report(hall / "store", "hall")["resumes"] == [1]
     with MapStore.open(hall / "store") as maps:
         assert "was interrupted; job 2 goes on" in maps.job(1).message
 

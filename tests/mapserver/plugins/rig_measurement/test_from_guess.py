@@ -96,8 +96,7 @@ def test_the_adjustment_finds_distortion_where_it_is_left_open(loop: Stretch) ->
         c.pixel_from_ray(c0.ray_from_pixel(px))
         for c, c0, px in zip(rig.cameras, true.cameras, (loop.left_px, loop.right_px), strict=True)
     ]
-    bent_stretch = replace(loop, left_px=exact[0], right_px=exact[1])
-    data = measured(bent_stretch, true, 1)
+    data = measured(replace(loop, left_px=exact[0], right_px=exact[1]), true, 1)
     wide = np.array([0.3, 0.3, 1e-3, 1e-3] + [1e-2, 1e-2, 1e-3, 1e-3] + [15.0] * 2)
     found = adjust(replace(data, lens_sigmas=wide)).lens
     assert found[0] == pytest.approx(-0.02, abs=0.005)

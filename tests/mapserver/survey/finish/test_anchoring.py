@@ -97,5 +97,4 @@ def test_the_longest_part_with_one_scale_is_kept(marks: str, scale_known: bool, 
         estimates, np.array([e.odom_from_body for e in estimates]), np.array([e.cov_rot_trans for e in estimates]),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), [], scale_known, scale_known,
     )  # fmt: skip
-    part = longest_run(guess, np.eye(4))
-    assert np.flatnonzero(part.tracked).tolist() == list(kept)
+    assert np.flatnonzero(longest_run(guess, np.eye(4)).tracked).tolist() == list(kept)

@@ -118,8 +118,7 @@ def test_odometry_joins_blind_frames_to_those_that_see(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_wrong_tracks_pull_no_frame_away(kind: str) -> None:
     given = with_spikes(drive(kind, slipped=0.1), [11, 17])
-    placed = place_frames(given.odometry, given.state, SETTINGS)
-    assert given.errors_m(placed).max() < 0.015
+    assert given.errors_m(place_frames(given.odometry, given.state, SETTINGS)).max() < 0.015
 
 
 def test_what_another_scale_follows_is_not_touched() -> None:

@@ -182,8 +182,7 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
     assert {r.verdict for r in records} == {LoopVerdict.AMBIGUOUS}
     assert all("exclude each other" in r.reason for r in records)
     assert not [e for e in loops.edges if e.i == 18]
-    counts = loops.counts()
-    assert counts["rejected"] >= len(records)
+    assert loops.counts()["rejected"] >= len(records)
 
 
 @pytest.mark.parametrize(

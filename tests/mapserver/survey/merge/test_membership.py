@@ -133,11 +133,9 @@ def test_a_session_whose_motion_is_broken_is_held(pieces: NDArray[np.int64] | No
 
 
 def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart() -> None:
-    twin = aisle(1, y_m=30.0)
-    both = together(HOME, twin)
+    both = together(HOME, aisle(1, y_m=30.0))
     known = relocalizer(both, np.concatenate([drive(56), drive(56, y_m=30.0)]))
-    held = refused(membership(known, both, PLACES, None))
-    assert "look alike" in held.reason
+    assert "look alike" in refused(membership(known, both, PLACES, None)).reason
     for y_m in (0.0, 30.0):
         places = drive(30, start_m=2.0, y_m=y_m)
         located = joined(membership(known, both, places, places[0]))
@@ -146,8 +144,7 @@ def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart(
 
 def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
     """Two thirds of it lead through what the map has not; two metres of overlap are too few places."""
-    known = relocalizer(HOME, drive(26))
-    located = joined(membership(known, HOME, drive(40, start_m=6.0), None))
+    located = joined(membership(relocalizer(HOME, drive(26)), HOME, drive(40, start_m=6.0), None))
     assert np.linalg.norm((located.map_from_body - drive(40, start_m=6.0))[:10, :3, 3], axis=1).max() < 0.03
     said, _ = verdict(membership(KNOWN, HOME, drive(5, start_m=6.0), None))
     assert said is MembershipVerdict.UNDECIDED

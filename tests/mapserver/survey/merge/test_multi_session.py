@@ -42,15 +42,13 @@ def test_recordings_that_overlap_follow_each_other_and_their_truth_with_them() -
     estimate = chained([first, second], [first, second])
     assert (np.diff(estimate.stamps_ns) > 0).all()
     moved_ns = estimate.stamps_ns[50] - second.stamps_ns[0]
-    truth = chained(truths, [first, second])
-    assert truth.stamps_ns[400] - truths[1].stamps_ns[0] == moved_ns
+    assert chained(truths, [first, second]).stamps_ns[400] - truths[1].stamps_ns[0] == moved_ns
 
 
 def test_each_landmark_keeps_enough_keyframes_and_no_more_are_taken() -> None:
     """Ten keyframes see all of thirty landmarks: three of them are enough; a landmark that only one sees keeps that one."""
     seen = [(k, n) for n in range(30) for k in range(10)] + [(10, 30)]
-    marks = plain_marks(seen, np.zeros((31, 3)))
-    fewer = fewer_keyframes(marks, 3)
+    fewer = fewer_keyframes(plain_marks(seen, np.zeros((31, 3))), 3)
     assert np.bincount(fewer.obs_landmark).tolist() == [3] * 30 + [1]
     assert len(np.unique(fewer.obs_keyframe)) == 4
 
@@ -110,8 +108,7 @@ MadeUpMap: Any = make_dataclass("MadeUpMap", ["letters", "trajectory", "trajecto
 
 
 def made_up_map(letters: str) -> Any:
-    drive = trajectory(10.0 * ord(letters[-1]), 4)
-    return MadeUpMap(letters, drive, np.ones(4, bool))
+    return MadeUpMap(letters, trajectory(10.0 * ord(letters[-1]), 4), np.ones(4, bool))
 
 
 @pytest.mark.parametrize(

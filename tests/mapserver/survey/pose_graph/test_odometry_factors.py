@@ -41,8 +41,7 @@ def estimate(
 
 
 def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() -> None:
-    given = scene(8, 3, drift=0.0)
-    state = given.state
+    state = scene(8, 3, drift=0.0).state
     dark = (state.landmarks.obs_keyframe == 3) | (state.landmarks.obs_keyframe == 4)
     state = replace(state, landmarks=state.landmarks.keep_observations(~dark, 1))
     truth = state.map_from_body.copy()
@@ -108,8 +107,7 @@ def test_what_a_filter_learns_of_earlier_places_is_no_doubt_of_the_way() -> None
     places = np.array([se3(np.eye(3), np.array([x, 0.0, 0.0])) for x in way_m])
     for seen, least_m, most_m in ((bend, 0.02, 0.05), (dark, 0.25, 0.3)):
         edges = chain_edges(passed(places, chain(*seen)), SimpleNamespace(map_from_body=places))
-        marginals = GraphMarginals(places, edges)
-        assert least_m < np.sqrt(marginals.relative_cov(0, 3)[3, 3]) < most_m
+        assert least_m < np.sqrt(GraphMarginals(places, edges).relative_cov(0, 3)[3, 3]) < most_m
 
 
 def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:

@@ -92,8 +92,7 @@ def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
         for i, j in combinations(range(4), 2)
     ]
     posed = RigImages.of(keyframes, map_from_body, rig_of(rectifier))
-    marks = build_landmarks(posed, tracks_of(pairs), settings)
-    return keyframes, map_from_body, rectifier, marks
+    return keyframes, map_from_body, rectifier, build_landmarks(posed, tracks_of(pairs), settings)
 
 
 def true_pixels() -> tuple[Array, Array]:
