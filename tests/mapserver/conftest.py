@@ -13,6 +13,7 @@ from mapserver.store import MapStore
 from mapserver.store.places import Places, write_places
 from support.command_line import status as status_of
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking, watch
+from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_world import World, served_world
 from support.pages.browser import Chromium, running_chromium
 from support.recordings.recording_samples import write_mcap
@@ -27,16 +28,22 @@ expect.set_options(timeout=30_000)  # a busy machine answers late
 
 
 @pytest.fixture(autouse=True)
-def roomy_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A terabyte is free on every disk that this process asks for."""
-    statvfs = os.statvfs
+def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """What is free on every disk that this process asks for: a terabyte, unless a test says otherwise."""
+    statvfs, free = os.statvfs, [1 << 40]
 
     def measured(path: int | Path) -> os.statvfs_result:
         found = list(statvfs(path))
-        found[1:5] = [1, 2 << 40, 1 << 40, 1 << 40]  # bytes: a block's size, all, free, free for us
+        found[1:5] = [1, 2 << 40, *free * 2]  # bytes: a block's size, all, free, free for us
         return os.statvfs_result(found)
 
     monkeypatch.setattr(os, "statvfs", measured)
+    return free
+
+
+@pytest.fixture(autouse=True)
+def quick_passwords(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_quick_passwords(monkeypatch)
 
 
 @pytest.fixture

@@ -5,9 +5,8 @@ their ends; without pictures, but for dropped frames: those are of a rendered dr
 of pictures. Half of these drop frames at random, half in bursts of up to a second.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import inf
 from pathlib import Path
 
@@ -149,19 +148,16 @@ def _kept(count: int, share: float, in_bursts: bool, rng: np.random.Generator) -
     return np.flatnonzero(kept)
 
 
-def _dropped(work: Path, share: float) -> Callable[[int, int], Outcome]:
-    def run(seed: int, number: int) -> Outcome:
-        rng, store = np.random.default_rng([seed, 4, int(100 * share), number]), surveyed(work)
-        with open_recording(recorded(work, ("--robot", "runner-1", "--day", "1"))) as recording:
-            frames = _kept(len(recording.frame_stamps_ns), share, number % 4 >= 2, rng)
-            seen = without_imu(recording) if number % 2 else recording
-            result = replayed(ReplaySource(seen, frames, reverse=False), store)
-        tracking = float(np.mean([frame.status is Status.TRACKING for frame in result.frames]))
-        says_carried = any(e.cause == "carried" for e in result.estimates)
-        silent = run_metrics.silent_failures(result.frames) or 0
-        return Outcome(run_metrics.position_failures(result.frames), silent, tracking, says_carried)
-
-    return run
+def _dropped(work: Path, share: float, seed: int, number: int) -> Outcome:
+    rng, store = np.random.default_rng([seed, 4, int(100 * share), number]), surveyed(work)
+    with open_recording(recorded(work, ("--robot", "runner-1", "--day", "1"))) as recording:
+        frames = _kept(len(recording.frame_stamps_ns), share, number % 4 >= 2, rng)
+        seen = without_imu(recording) if number % 2 else recording
+        result = replayed(ReplaySource(seen, frames, reverse=False), store)
+    tracking = float(np.mean([frame.status is Status.TRACKING for frame in result.frames]))
+    says_carried = any(e.cause == "carried" for e in result.estimates)
+    silent = run_metrics.silent_failures(result.frames) or 0
+    return Outcome(run_metrics.position_failures(result.frames), silent, tracking, says_carried)
 
 
 def _figures(found: list[Outcome]) -> dict[str, float]:
@@ -179,7 +175,7 @@ LOSSES = {f"{share:.0%} {_DROPPED}": share for share in _SHARES}
 
 @benchmark([*CASES, *LOSSES], runs=50, seed=900)
 def main(arguments: Options) -> Results:
-    cases = CASES | {name: _dropped(arguments.work, share) for name, share in LOSSES.items()}
+    cases = CASES | {name: partial(_dropped, arguments.work, share) for name, share in LOSSES.items()}
     figures = {}
     for name in arguments.only:
         found = [cases[name](arguments.seed, number) for number in range(arguments.runs)]

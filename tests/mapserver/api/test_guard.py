@@ -6,7 +6,6 @@ Each attack also runs against the same application without the guard, where it w
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from unittest.mock import Mock
 
 import anyio
@@ -24,21 +23,13 @@ from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.install import install_sign_in
 from mapserver.operators.operators import IDLE_S, Operators
 from mapserver.store import Actor
-from support.fleet.quick_passwords import use_quick_passwords
-from support.fleet.served_api import Server, check_problem, named, served_api
+from support.fleet.served_api import Server, check_problem, named
 from support.storage.map_samples import save_sample_draft
 
 PASSWORD = "a password of the test"
 EVIL = "http://evil.example"
 ACT = {"actor": "ada", "reason": "monday"}
 PUBLISH = "/v1/sites/lab/versions/2/publish"
-
-
-@pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    use_quick_passwords(monkeypatch)
-    with served_api(tmp_path) as made:
-        yield made
 
 
 @contextmanager

@@ -140,25 +140,18 @@ def test_half_an_upload_leaves_nothing(server: Server, lab: Path) -> None:
     assert files(lab) == [".friday.mcap.part"], "what a killed server left is removed, other programs' files are not"
 
 
-def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write, statvfs = os.write, os.statvfs
-    free = [1 << 40]
+def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch, free_bytes: list[int]) -> None:
+    write = os.write
 
     def filled(descriptor: int, data: bytes) -> int:
         if Path(f"/proc/self/fd/{descriptor}").readlink().suffix == ".part":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return write(descriptor, data)
 
-    def measured(path: Path) -> os.statvfs_result:
-        found = list(statvfs(path))
-        found[1:5] = [1, 100 << 30, free[0], free[0]]  # bytes: a block's size, all, free, free for us
-        return os.statvfs_result(found)
-
-    monkeypatch.setattr(os, "statvfs", measured)
     with monkeypatch.context() as context:
         context.setattr(os, "write", filled)
         check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=b"x"), 503, "No space left")
-    free[0] = (4 << 30) + 100
+    free_bytes[0] = (4 << 30) + 100
     for content in (bytes(101), iter([bytes(101)])):
         check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=content), 409, "is too large")
     assert server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=bytes(100)).status_code == 201

@@ -20,7 +20,6 @@ from mapserver.commands.operation_commands import with_operations
 from mapserver.dashboard.install import install_dashboard
 from mapserver.operators.roles import Scope
 from mapserver.store import NOBODY
-from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import check_problem, served_api
 
 Loud = Annotated[int, typer.Option(min=1, max=3, help="How loud.")]
@@ -40,8 +39,7 @@ def greeting() -> Iterator[None]:
     del OPERATIONS["greet"]
 
 
-def test_an_operation_has_all_doors(greeting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_quick_passwords(monkeypatch)
+def test_an_operation_has_all_doors(greeting: None, tmp_path: Path) -> None:
     with served_api(tmp_path) as server:
         client, operators = server.client, server.client.app.state.served.operators
         install_dashboard(client.app, server.store, server.fleet, ApiSettings())

@@ -12,7 +12,6 @@ from mapserver.operators.operators import Operators
 from mapserver.store import Actor
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
-from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import Server, check_problem, served_api
 from support.fleet.served_api import named as sessions
 
@@ -31,9 +30,8 @@ LISTS = (("/v1/operators", "operators"), ("/v1/log", "operators"), ("/v1/sites/l
 
 
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(tmp_path: Path) -> Iterator[Server]:
     """A server of enrolled robots, which has heard r1."""
-    use_quick_passwords(monkeypatch)
     with served_api(tmp_path) as made:
         init_here(made.store)
         RobotRegister(made.store).authorities.init(["127.0.0.1", "maps.example"], None, None)

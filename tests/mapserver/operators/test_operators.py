@@ -10,7 +10,6 @@ from mapserver.operators import operators as module
 from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S, Operators
 from mapserver.serving.http_connections import binding_fault
 from mapserver.store import Actor, MapStore
-from support.fleet.quick_passwords import use_quick_passwords
 from support.storage.clock import Clock
 from support.waiting import eventually
 
@@ -23,11 +22,6 @@ DUMMY = module._dummy.__wrapped__  # as it is, without its cache
 @pytest.fixture
 def clock() -> Clock:
     return Clock(1_800_000_000 * NS)
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_quick_passwords(monkeypatch)
 
 
 @pytest.fixture

@@ -84,12 +84,17 @@ def is_ended(connection: socket.socket) -> bool:
     return True
 
 
-def is_answered(door: Door, source: str) -> bool:
+def answers(one: socket.socket) -> bool:
     try:
-        with door.connect(GET % (b"", b""), source) as one:
-            return one.recv(1) == b"H"
+        one.sendall(GET % (b"", b""))
+        return one.recv(1) == b"H"
     except ConnectionError:
         return False
+
+
+def is_answered(door: Door, source: str) -> bool:
+    with door.connect(source=source) as one:
+        return answers(one)
 
 
 @contextmanager
@@ -166,13 +171,6 @@ def test_connections_are_shared_among_addresses(monkeypatch: pytest.MonkeyPatch,
             """Which of some new connections are answered; they stay open."""
             made = [stack.enter_context(door.connect(source=source)) for _ in range(count)]
             return [answers(one) for one in made]
-
-        def answers(one: socket.socket) -> bool:
-            try:
-                one.sendall(GET % (b"", b""))
-                return one.recv(1) == b"H"
-            except ConnectionError:
-                return False
 
         many = take("127.0.0.1", 6)
         if is_behind_proxy:

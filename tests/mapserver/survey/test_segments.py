@@ -103,14 +103,6 @@ def test_segments_make_a_map_as_good_as_the_whole() -> None:
     assert ate_m(done) < max(1.1 * ate_m(whole), ate_m(whole) + 0.001)
 
 
-@pytest.mark.parametrize("in_file", [True, False])
-def test_who_makes_them_and_where_pictures_lie_does_not_matter(in_file: bool, tmp_path: Path) -> None:
-    with open_executor(2, None) as executor, MappedImageStore(tmp_path) as images:
-        made = surveyed(SEGMENTS, executor, images=images if in_file else None)
-        assert encode_archive(made.map) == encode_archive(alone().map)
-        assert all((keyframe.images is images) == in_file for keyframe in made.odometry.keyframes)
-
-
 class Elsewhere:
     """An executor whose batches and results travel as to another machine."""
 
@@ -119,11 +111,15 @@ class Elsewhere:
             yield pickle.loads(pickle.dumps(function(shared, pickle.loads(pickle.dumps(batch)))))
 
 
-def test_processes_elsewhere_send_their_pictures(tmp_path: Path) -> None:
-    with MappedImageStore(tmp_path) as images:
-        made = surveyed(SEGMENTS, Elsewhere(), images=images)
+@pytest.mark.parametrize("is_elsewhere", [True, False])
+@pytest.mark.parametrize("in_file", [True, False])
+def test_who_makes_them_and_where_pictures_lie_does_not_matter(
+    in_file: bool, is_elsewhere: bool, tmp_path: Path
+) -> None:
+    with open_executor(2, None) as executor, MappedImageStore(tmp_path) as images:
+        made = surveyed(SEGMENTS, Elsewhere() if is_elsewhere else executor, images=images if in_file else None)
         assert encode_archive(made.map) == encode_archive(alone().map)
-        assert all(keyframe.images is images for keyframe in made.odometry.keyframes)
+        assert all((keyframe.images is images) == in_file for keyframe in made.odometry.keyframes)
 
 
 def test_a_segment_that_cannot_start_is_surveyed_with_the_one_before() -> None:

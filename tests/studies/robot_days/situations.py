@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -59,19 +60,15 @@ def _driving(way: Route, rng: np.random.Generator) -> Trip:
     return Trip("", (way,))
 
 
-def _fault(name: str, shortest_s: float, longest_s: float) -> TripOf:
+def _fault(name: str, shortest_s: float, longest_s: float, way: Route, rng: np.random.Generator) -> Trip:
     """Events of a random length, each long enough after the last one for a robot to have recovered: five seconds of good tracking end
     a failure."""
-
-    def trip(way: Route, rng: np.random.Generator) -> Trip:
-        faults, begins = [], _FIRST_S + float(rng.uniform(0.0, 2.0))
-        while begins < _LAST_S:
-            ends = begins + float(rng.uniform(shortest_s, longest_s))
-            faults.append(Fault(name, begins, ends))
-            begins = ends + _RECOVERS_S + float(rng.uniform(0.0, 2.0))
-        return Trip("", (way,), faults=tuple(faults))
-
-    return trip
+    faults, begins = [], _FIRST_S + float(rng.uniform(0.0, 2.0))
+    while begins < _LAST_S:
+        ends = begins + float(rng.uniform(shortest_s, longest_s))
+        faults.append(Fault(name, begins, ends))
+        begins = ends + _RECOVERS_S + float(rng.uniform(0.0, 2.0))
+    return Trip("", (way,), faults=tuple(faults))
 
 
 def _dock(way: Route, rng: np.random.Generator) -> Trip:
@@ -88,23 +85,19 @@ def _carried(way: Route, rng: np.random.Generator) -> Trip:
     return Trip(f"carried-{before.way_points_map[0][0]:.3f}", (before, way))
 
 
-def _met(kind: str, count: int, speed_mps: float, beside_m: float) -> TripOf:
+def _met(kind: str, count: int, speed_mps: float, beside_m: float, way: Route, rng: np.random.Generator) -> Trip:
     """So many people or vehicles that go to and fro in each aisle that the robot passes."""
-
-    def trip(way: Route, rng: np.random.Generator) -> Trip:
-        movers = []
-        for (start_x, y_m), (end_x, end_y) in pairwise(way.way_points_map):
-            if y_m != end_y or abs(end_x - start_x) < _LEG_M:
-                continue
-            middle_y = LAYOUT.aisle_y_m(LAYOUT.chunk_at(start_x, y_m)[1])
-            side_y = middle_y + (beside_m if y_m < middle_y else -beside_m)
-            for _ in range(count):
-                x_m, reach_m = float(rng.uniform(*sorted((start_x, end_x)))), float(rng.uniform(1.0, 4.0))
-                stations = ((x_m - reach_m, side_y), (x_m + reach_m, side_y))
-                movers.append(patrol(kind, stations, speed_mps, float(rng.uniform(0.0, 4 * reach_m))))
-        return Trip("", (way,), movers=tuple(movers))
-
-    return trip
+    movers = []
+    for (start_x, y_m), (end_x, end_y) in pairwise(way.way_points_map):
+        if y_m != end_y or abs(end_x - start_x) < _LEG_M:
+            continue
+        middle_y = LAYOUT.aisle_y_m(LAYOUT.chunk_at(start_x, y_m)[1])
+        side_y = middle_y + (beside_m if y_m < middle_y else -beside_m)
+        for _ in range(count):
+            x_m, reach_m = float(rng.uniform(*sorted((start_x, end_x)))), float(rng.uniform(1.0, 4.0))
+            stations = ((x_m - reach_m, side_y), (x_m + reach_m, side_y))
+            movers.append(patrol(kind, stations, speed_mps, float(rng.uniform(0.0, 4 * reach_m))))
+    return Trip("", (way,), movers=tuple(movers))
 
 
 def _smudged(way: Route, rng: np.random.Generator) -> Trip:
@@ -120,15 +113,15 @@ SITUATIONS = {
         Situation("driving, 2 or 3 nights old", 1.6, "assumption: 10 %", _driving, 8, "hours", (3, 2)),
         Situation("driving, 4 to 7 nights old", 0.8, "assumption: 5 %", _driving, 8, "hours", (7, 5)),
         Situation("driving, a smudge on the lens", 0.16, "assumption: 1 % of it", _smudged, 8, "hours"),
-        Situation("people met in the aisle", 200, _GUESS, _met("person", 2, 1.2, 0.75), 16),
-        Situation("a forklift met in the aisle", 60, _GUESS, _met("forklift", 1, 0.8, 0.6), 12),
-        Situation("a person right in front for 1 to 4 s", 20, _GUESS, _fault("person-in-front", 1.0, 4.0), 12),
-        Situation("glare for 1 to 2 s", 10, _GUESS, _fault("over-exposure", 1.0, 2.0), 8),
+        Situation("people met in the aisle", 200, _GUESS, partial(_met, "person", 2, 1.2, 0.75), 16),
+        Situation("a forklift met in the aisle", 60, _GUESS, partial(_met, "forklift", 1, 0.8, 0.6), 12),
+        Situation("a person right in front for 1 to 4 s", 20, _GUESS, partial(_fault, "person-in-front", 1.0, 4.0), 12),
+        Situation("glare for 1 to 2 s", 10, _GUESS, partial(_fault, "over-exposure", 1.0, 2.0), 8),
         Situation("docking", 16, "assumption: once an hour", _dock, 16, length_m=0.0),
-        Situation("black for 1 to 2 s", 2, _GUESS, _fault("camera-dark", 1.0, 2.0), 8),
-        Situation("no frames for 0.3 to 1.5 s", 1, _GUESS, _fault("frames-dropped", 0.3, 1.5), 8),
-        Situation("no IMU for 0.2 to 0.5 s", 0.5, _GUESS, _fault("imu-gap", 0.2, 0.5), 8),
-        Situation("wheels slip for 1 to 3 s", 20, _GUESS, _fault("wheel-slip", 1.0, 3.0), 8),
+        Situation("black for 1 to 2 s", 2, _GUESS, partial(_fault, "camera-dark", 1.0, 2.0), 8),
+        Situation("no frames for 0.3 to 1.5 s", 1, _GUESS, partial(_fault, "frames-dropped", 0.3, 1.5), 8),
+        Situation("no IMU for 0.2 to 0.5 s", 0.5, _GUESS, partial(_fault, "imu-gap", 0.2, 0.5), 8),
+        Situation("wheels slip for 1 to 3 s", 20, _GUESS, partial(_fault, "wheel-slip", 1.0, 3.0), 8),
         Situation("restart anywhere, told nothing", 0.2, _GUESS, _driving, 32, length_m=_SHORT_M, prior="none"),
         Situation(
             "restart, told a wrong aisle", 0.02, "assumption: one restart in ten", _driving, 16, length_m=_SHORT_M, prior="wrong aisle"

@@ -36,7 +36,6 @@ from mapserver.store.files import make_folder
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
 
@@ -116,7 +115,6 @@ def answers(
     """The statuses of answers by operation. fill: adds versions from 3 on to site `hall`; chosen: parts of the path that every other
     question to an operation has; paths: a regular expression of those that are asked, all without one.
     """
-    use_quick_passwords(monkeypatch)
     now_ns = time.time_ns()
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         publish_samples(store, 2, site="hall")

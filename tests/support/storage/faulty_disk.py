@@ -256,8 +256,8 @@ def _install_sqlite(disk: Disk) -> None:
     ours = _Vfs.from_buffer_copy(unix)
     ours.name = b"faulty"
     ours.open = _pointer(_opening(disk, _OPEN(unix.open)))
-    ours.delete = _pointer(_deleting(disk, _DELETE(unix.delete)))
-    ours.access = _pointer(_looking(disk, _ACCESS(unix.access)))
+    ours.delete = _pointer(_DELETE(partial(_delete, disk, _DELETE(unix.delete))))
+    ours.access = _pointer(_ACCESS(partial(_look, disk, _ACCESS(unix.access))))
     _kept.append(ours)
     assert library.sqlite3_vfs_register(ctypes.byref(ours), 1) == 0
 
@@ -333,25 +333,19 @@ def _call_method(disk: Disk, files: dict[int, list[Any]], name: str, real: Any, 
     return int(real(file, *arguments))
 
 
-def _deleting(disk: Disk, real: Any) -> Any:
-    def call(vfs: int, name: bytes, sync: int) -> int:
-        path = name.decode()
-        if disk.holds(path):
-            if code := _code(disk, "unlink"):
-                return code
-            if os.access(path, os.F_OK):
-                disk.note("unlink", path)
-                if sync:
-                    disk.note("sync_folder", folder_of(path))
-        return int(real(vfs, name, sync))
-
-    return _DELETE(call)
-
-
-def _looking(disk: Disk, real: Any) -> Any:
-    def call(vfs: int, name: bytes, flags: int, found: int) -> int:
-        if disk.holds(name.decode()) and (code := _code(disk, "look")):
+def _delete(disk: Disk, real: Any, vfs: int, name: bytes, sync: int) -> int:
+    path = name.decode()
+    if disk.holds(path):
+        if code := _code(disk, "unlink"):
             return code
-        return int(real(vfs, name, flags, found))
+        if os.access(path, os.F_OK):
+            disk.note("unlink", path)
+            if sync:
+                disk.note("sync_folder", folder_of(path))
+    return int(real(vfs, name, sync))
 
-    return _ACCESS(call)
+
+def _look(disk: Disk, real: Any, vfs: int, name: bytes, flags: int, found: int) -> int:
+    if disk.holds(name.decode()) and (code := _code(disk, "look")):
+        return code
+    return int(real(vfs, name, flags, found))

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from fleetmap.mapformat.names import blob_path
 from mapserver.store import MapStore
-from mapserver.store.places import open_objects, read_places
 
 KEYS = {"AWS_ACCESS_KEY_ID": "accesskey", "AWS_SECRET_ACCESS_KEY": "secretkey", "AWS_REGION": "us-east-1"}
 
@@ -35,21 +34,13 @@ class Content:
     """What lies under the addresses of a store, beside the store's own methods."""
 
     def __init__(self, store: MapStore) -> None:
-        self._root, self._url = store.folder, read_places(store.folder).content
+        self._objects = store._blobs._objects
 
     def write(self, sha256: str, data: bytes) -> None:
-        if self._url is None:
-            (self._root / blob_path(sha256)).write_bytes(data)
-        else:
-            open_objects(self._url).put(blob_path(sha256), [data])
+        self._objects.put(blob_path(sha256), [data])
 
     def remove(self, sha256: str) -> None:
-        if self._url is None:
-            (self._root / blob_path(sha256)).unlink()
-        else:
-            open_objects(self._url).remove(blob_path(sha256))
+        self._objects.remove(blob_path(sha256))
 
     def count(self) -> int:
-        if self._url is None:
-            return sum(1 for _ in (self._root / "blobs").glob("??/*"))
-        return sum(1 for _ in open_objects(self._url).listed("blobs"))
+        return sum(1 for _ in self._objects.listed("blobs"))
