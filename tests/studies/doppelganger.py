@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from studies.study import Column, Row, publish, results, rms, table
+from studies.study import Column, Row, publish, results, rms, study, table
 
 APART_M, LONG_M = 5, 40
 # Corner to corner: corridor A, home through C, corridor B, home through C, corridor A.
@@ -130,6 +130,7 @@ def draw(rows: list[Row]) -> Figure:
     return figure
 
 
+@study
 def main() -> None:
     """Rows, table and picture of docs/studies/doppelganger.md."""
     ways: tuple[Way, ...] = ("appearance", "robust", "gate", "gate and step")
@@ -141,7 +142,3 @@ def main() -> None:
         Column("worst_m", "worst seed, m", "{:.3f}"),
     ]  # fmt: skip
     publish("doppelganger", [table(rows, shown)], draw(rows))
-
-
-if __name__ == "__main__":
-    main()

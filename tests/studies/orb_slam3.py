@@ -24,7 +24,7 @@ from fleetmap.recordings.tum import read_tum
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import Trajectory
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from studies.study import Column, Row, environment, publish, results, table
+from studies.study import Column, Row, environment, publish, results, study, table
 from support.recordings.realdata import DATA
 
 PROGRAM = Path(__file__).with_name("orb_slam3_program.py")
@@ -187,11 +187,8 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+@study
 def main() -> None:
     """The table of docs/studies/orb_slam3.md. TURNS=5: so many rounds of a recording."""
     environment(*WHEELS)
     publish("orb_slam3", [table(results("orb_slam3", CASES), COLUMNS)], None)
-
-
-if __name__ == "__main__":
-    main()

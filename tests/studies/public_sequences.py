@@ -21,7 +21,7 @@ from locclient.replay.run_result import ReplayResult
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired
 from mapserver.plugins.trajectory_errors.errors import at_first_stamp
 from mapserver.survey.odometry_pass import FrameChain
-from studies.study import PAGES, Column, Row, between_marks, publish, results, rms, table
+from studies.study import PAGES, Column, Row, between_marks, publish, results, rms, study, table
 from support.recordings.hashes import hashed, tiles_of
 from support.recordings.realdata import DATA
 
@@ -144,6 +144,7 @@ def draw(rows: list[Row]) -> Figure:
     return figure
 
 
+@study
 def main() -> None:
     """Rows and picture of docs/studies/public_sequences.md and the table of docs/comparison.md. `--out FILE`: rows as JSON, no page."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -155,7 +156,3 @@ def main() -> None:
     shown = table(rows, COLUMNS)
     publish("public_sequences", [shown], draw(rows))
     COMPARISON.write_text(between_marks(COMPARISON.read_text(), shown, COMPARISON))
-
-
-if __name__ == "__main__":
-    main()

@@ -19,7 +19,7 @@ from mapserver import build_map
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from studies.orb_slam3 import ate_mm, body_from_left, export_images, lens_of
 from studies.public_sequences import PEERS
-from studies.study import Column, Row, environment, publish, results, table
+from studies.study import Column, Row, environment, publish, results, study, table
 from support.recordings.realdata import DATA
 
 NAME = "left/{:06d}.png"
@@ -119,10 +119,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+@study
 def main() -> None:
     """The table of docs/studies/pycolmap_check.md."""
     publish("pycolmap_check", [table(results("pycolmap_check", CASES), COLUMNS)], None)
-
-
-if __name__ == "__main__":
-    main()

@@ -43,6 +43,13 @@ class Column(NamedTuple):
     form: str = "{}"
 
 
+def study(main: Callable[[], None]) -> Callable[[], None]:
+    """Runs a function where its file is the program."""
+    if main.__module__ == "__main__":
+        main()
+    return main
+
+
 def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[int] = ()) -> list[Row]:
     """A row for each case: those in the kept file, the others made now and kept one by one. `seeds` are kept beside them."""
     path = PAGES / f"{name}.json"

@@ -28,7 +28,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.plugins.nightly_builds.night import NightRequest, last_report, run_night
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
-from studies.study import PAGES, Column, Row, publish, results, table
+from studies.study import PAGES, Column, Row, publish, results, study, table
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 SEED, OTHER_SEED, NIGHTS = 547, 787, 30  # of the site, of the building that the foreign recording is from
@@ -233,6 +233,7 @@ def draw(rows: list[Row]) -> Figure:
     return figure
 
 
+@study
 def main() -> None:
     """Rows, tables and picture of docs/studies/thirty_nights.md."""
     if os.environ.get("FRESH"):
@@ -245,7 +246,3 @@ def main() -> None:
         Column("half", "half-life, nights"),
     ]
     publish("thirty_nights", [table([shown(row) for row in rows], COLUMNS), table(half_lives(rows), sits)], draw(rows))
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from studies.robot_days.drives import CONFIGURATIONS, FULL, row_of
 from studies.robot_days.situations import SITUATIONS
-from studies.study import Column, Row, publish, results, table
+from studies.study import Column, Row, publish, results, study, table
 
 SEEDS = 1009, 2003, 3001  # of the sites; the other configurations drive the first
 _ROUNDS = 8
@@ -153,6 +153,7 @@ def draw(found: list[Row]) -> Figure:
     return figure
 
 
+@study
 def main() -> None:
     """Rows, tables and picture of docs/studies/warehouse.md."""
     rows = results("warehouse", cases(), SEEDS)
@@ -170,7 +171,3 @@ def main() -> None:
         Column("p99", "p99 error, mm", "{:.0f}"),
     ]  # fmt: skip
     publish("warehouse", [table(found, shown), table(situation_rows(rows), parts)], draw(found))
-
-
-if __name__ == "__main__":
-    main()

@@ -10,19 +10,10 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
+from fleetsim import sensors
 from fleetsim.motion import Route, RouteMotion
 from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import SCENARIOS
-from fleetsim.sensors import (
-    START_NS,
-    Fault,
-    FaultPlan,
-    measure_imu,
-    measure_wheels,
-    nominal_calibration,
-    sample_times,
-    true_calibration,
-)
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, unpictured
 
@@ -54,7 +45,7 @@ class Site:
         self._robots = list(SCENARIOS[_SCENARIO]().runs)
 
     def session(
-        self, seed: int, robot: str | None = None, rest_s: float | None = None, faults: tuple[Fault, ...] = (), *,
+        self, seed: int, robot: str | None = None, rest_s: float | None = None, faults: tuple[sensors.Fault, ...] = (), *,
         camera_delay_s: float = 0.0, lost_share: float = 0.0,
     ) -> EstimatorSession:  # fmt: skip
         """The run of a seed: another robot, another drive, other errors. Faults are those of IMU, wheels and frames.
@@ -68,15 +59,19 @@ class Site:
         places = tuple((x + dx, y + dy) for (x, y), (dx, dy) in zip(route.way_points_map, shifts.tolist(), strict=True))
         driven = Route(places, route.stops, route.rest_s if rest_s is None else rest_s)
         motion = RouteMotion(driven, kind.limits, kind.body_height_m, kind.shake, rng)
-        plan = FaultPlan(faults)
-        times = [t for t in sample_times(motion.duration_s, run.rate_hz).tolist() if not plan.has("frames-dropped", t)]
+        plan = sensors.FaultPlan(faults)
+        times = [
+            t
+            for t in sensors.sample_times(motion.duration_s, run.rate_hz).tolist()
+            if not plan.has("frames-dropped", t)
+        ]
         if lost_share > 0:
             times = [t for t in times if rng.random() >= lost_share]
         session: Session = replace(
-            self._base, order=replace(self._base.order, seed=seed, robot=name), nominal=nominal_calibration(kind),
-            true=true_calibration(kind, rng), motion=motion, frame_times_s=tuple(times),
-            imu=plan.spoil_imu(measure_imu(motion, kind.imu, rng)),
-            wheel=plan.spoil_wheels(measure_wheels(motion, kind.body_height_m, rng)), priors=(),
+            self._base, order=replace(self._base.order, seed=seed, robot=name), nominal=sensors.nominal_calibration(kind),
+            true=sensors.true_calibration(kind, rng), motion=motion, frame_times_s=tuple(times),
+            imu=plan.spoil_imu(sensors.measure_imu(motion, kind.imu, rng)),
+            wheel=plan.spoil_wheels(sensors.measure_wheels(motion, kind.body_height_m, rng)), priors=(),
         )  # fmt: skip
         made = EstimatorSession(session, field=self._field)
         made.stamps_ns = [stamp_ns - int(camera_delay_s * 1e9) for stamp_ns in made.stamps_ns]
@@ -125,7 +120,7 @@ def run(
 def with_imu_of(session: EstimatorSession, other: EstimatorSession, from_s: float) -> EstimatorSession:
     """The run with another run's IMU from a time on."""
     own, foreign = session.session.imu, other.session.imu
-    turn_ns = START_NS + int(from_s * 1e9)
+    turn_ns = sensors.START_NS + int(from_s * 1e9)
     before, after = own.between(0, turn_ns), foreign.between(turn_ns, 1 << 62)
     mixed = ImuSamples(*(np.concatenate([getattr(part, name) for part in (before, after)]) for name in _COLUMNS))
     return EstimatorSession(replace(session.session, imu=mixed), field=session._field)
@@ -134,7 +129,7 @@ def with_imu_of(session: EstimatorSession, other: EstimatorSession, from_s: floa
 def with_frozen_gyro(session: EstimatorSession, starts_s: Array, duration_s: float) -> EstimatorSession:
     """The run with a gyro that repeats its sample at each start for a while."""
     imu = session.session.imu
-    times_s, gyro_radps = (imu.stamps_ns - START_NS) * 1e-9, imu.gyro_radps.copy()
+    times_s, gyro_radps = (imu.stamps_ns - sensors.START_NS) * 1e-9, imu.gyro_radps.copy()
     for start_s in starts_s:
         frozen = np.flatnonzero((times_s >= start_s) & (times_s < start_s + duration_s))
         gyro_radps[frozen] = gyro_radps[frozen[0]]

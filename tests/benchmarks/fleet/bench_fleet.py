@@ -19,17 +19,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.fleet.server_process import SITE, measured
+from fleetmap import messages
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
-from fleetmap.messages import (
-    FailureAck,
-    FailureReport,
-    PoseMessage,
-    RobotHealth,
-    decode_message,
-    encode_message,
-    robot_key,
-)
 from mapserver import releases
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters
 from mapserver.store import DraftContent, FailureFilter, FleetBatch, MapStore
@@ -58,21 +50,23 @@ class _Robot:
             bad_tile=number % _TILES, ahead_s=(number % 7) - 3.0, cause=("dark", "blur", "covered")[number % 3], suspected_share=0.2,
         )  # fmt: skip
         self.bus = Bus(endpoint).open()
-        self.alive = self.bus.declare_alive(robot_key(SITE, self.made.name, "alive"))
+        self.alive = self.bus.declare_alive(messages.robot_key(SITE, self.made.name, "alive"))
 
-    def say(self, message: RobotHealth | PoseMessage) -> None:
-        what = "health" if isinstance(message, RobotHealth) else "pose"
-        self.bus.publish(robot_key(SITE, self.made.name, what), encode_message(message), may_drop=what == "pose")
+    def say(self, message: messages.RobotHealth | messages.PoseMessage) -> None:
+        what = "health" if isinstance(message, messages.RobotHealth) else "pose"
+        self.bus.publish(
+            messages.robot_key(SITE, self.made.name, what), messages.encode_message(message), may_drop=what == "pose"
+        )
 
-    def report(self, failure: FailureReport) -> None:
+    def report(self, failure: messages.FailureReport) -> None:
         """Asks until it is acknowledged."""
-        key = robot_key(SITE, failure.robot, "failures")
+        key = messages.robot_key(SITE, failure.robot, "failures")
         while True:
             try:
-                answer = self.bus.get(key, encode_message(failure), timeout_s=10.0)
+                answer = self.bus.get(key, messages.encode_message(failure), timeout_s=10.0)
             except FleetmapError:
                 continue
-            assert decode_message(answer, FailureAck) == FailureAck(id=failure.id)
+            assert messages.decode_message(answer, messages.FailureAck) == messages.FailureAck(id=failure.id)
             return
 
 
@@ -81,7 +75,7 @@ def _drive(robots: list[_Robot], seconds: int, pool: ThreadPoolExecutor) -> floa
     begun_s, late_s = time.monotonic(), 0.0
     for step in range(1, seconds + 1):
         now_ns = time.time_ns()
-        later: list[tuple[_Robot, PoseMessage | RobotHealth]] = []
+        later: list[tuple[_Robot, messages.PoseMessage | messages.RobotHealth]] = []
         for place, robot in enumerate(robots):
             offset_s = 0.5 * place / len(robots)
             time.sleep(max(0.0, begun_s + step - 1 + offset_s - time.monotonic()))

@@ -25,13 +25,7 @@ from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings
-from mapserver.drafting.survey_recordings import (
-    OpenRecordings,
-    RecordingOptions,
-    RecordingSurvey,
-    admit_recordings,
-    survey_recording,
-)
+from mapserver.drafting import survey_recordings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap
@@ -71,17 +65,17 @@ def recorded(seed: int, n: int, work: Path) -> Path:
     return path
 
 
-def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> RecordingSurvey:
+def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> survey_recordings.RecordingSurvey:
     """The survey of a recording's frames, without a store."""
-    reading = OpenRecordings(RecordingOptions(frames), path.parent)
-    admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
+    reading = survey_recordings.OpenRecordings(survey_recordings.RecordingOptions(frames), path.parent)
+    admitted = survey_recordings.admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
     with reading.open(path) as (recording, _):
         settings = survey_settings(None, recording.sensor_set)
     config = SurveyConfig(settings, default_vocabulary())
-    return survey_recording(path, admitted[path], reading, pinhole, config, SurveyTools())[0]
+    return survey_recordings.survey_recording(path, admitted[path], reading, pinhole, config, SurveyTools())[0]
 
 
-def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[RecordingSurvey]) -> float:
+def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[survey_recordings.RecordingSurvey]) -> float:
     """Of all estimated frames, after one alignment."""
     found, true = list[Array](), list[Array]()
     for trajectory, survey in zip(trajectories, surveys, strict=True):
@@ -96,7 +90,7 @@ def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[RecordingSurvey]
     ).rmse_m
 
 
-def added(base: SurveyMap | None, surveys: Sequence[RecordingSurvey]) -> MergedMap:
+def added(base: SurveyMap | None, surveys: Sequence[survey_recordings.RecordingSurvey]) -> MergedMap:
     """The map with these sessions; RuntimeError if one is not joined."""
     settings = survey_settings(None, surveys[0].sensor_set)
     way_m = np.diff(surveys[0].survey.map.trajectory.positions_m, axis=0)
@@ -129,7 +123,7 @@ def noted_moves() -> Iterator[list[Array]]:
         yield moves
 
 
-def joined(surveys: Sequence[RecordingSurvey]) -> dict[str, Any]:
+def joined(surveys: Sequence[survey_recordings.RecordingSurvey]) -> dict[str, Any]:
     """Errors alone, joined in one night, and joined one by one to a published map."""
     alone = [ate_m([each.survey.map.trajectory], [each]) for each in surveys]
     shares = [float(each.survey.map.trajectory_estimated.mean()) for each in surveys]
@@ -158,7 +152,7 @@ def joined(surveys: Sequence[RecordingSurvey]) -> dict[str, Any]:
 def main(given: Options) -> Results:
     figures = {}
     for name in given.only:
-        surveys = list[RecordingSurvey]()
+        surveys = list[survey_recordings.RecordingSurvey]()
         parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
         for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
             surveys.append(surveyed(path, frames, surveys[0].survey.state.rig.camera if surveys else None))

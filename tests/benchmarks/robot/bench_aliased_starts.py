@@ -13,19 +13,7 @@ from dataclasses import asdict
 import numpy as np
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
-from benchmarks.robot.aliased_starts import (
-    WHOLE_SITE,
-    Site,
-    Start,
-    among_racks,
-    drive_from,
-    resolving_start_at,
-    standing_start_at,
-    start_at,
-    summary,
-    surveyed_site,
-    with_aisles,
-)
+from benchmarks.robot import aliased_starts
 from locclient.localization.settings import LocalizerSettings
 
 WITHIN_S, WITHIN_M = 3.0, 5.0
@@ -51,25 +39,32 @@ KINDS = (
 _PRIORS_M = {"no prior": None, _WHOLE: None, _ONE_WAY: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
 
 
-def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
+def starts_of(name: str, site: aliased_starts.Site, count: int, seed: int) -> list[aliased_starts.Start]:
     """So many starts of one kind, spread over the drive."""
     rng, robot = np.random.default_rng([seed, 1]), site.robot
     if name == _ONE_WAY_STANDING:
-        return [standing_start_at(site, n, _FOLLOWED_S) for n in _spread(30, len(robot) - 60, count)]
+        return [aliased_starts.standing_start_at(site, n, _FOLLOWED_S) for n in _spread(30, len(robot) - 60, count)]
     if name in _PRIORS_M:
-        settings = WHOLE_SITE if name == _WHOLE else LocalizerSettings()
+        settings = aliased_starts.WHOLE_SITE if name == _WHOLE else LocalizerSettings()
         numbers = _spread(30, len(robot) - 60, count)
-        return [start_at(site, n, _FOLLOWED_S, _PRIORS_M[name], rng, settings) for n in numbers]
-    frames = among_racks(robot)
+        return [aliased_starts.start_at(site, n, _FOLLOWED_S, _PRIORS_M[name], rng, settings) for n in numbers]
+    frames = aliased_starts.among_racks(robot)
     if name == _ALONG:
-        return [drive_from(site, n, _ALONG_M, WHOLE_SITE) for n in _spread(frames[0], frames[-1] - 60, -(-count // 10))]
+        return [
+            aliased_starts.drive_from(site, n, _ALONG_M, aliased_starts.WHOLE_SITE)
+            for n in _spread(frames[0], frames[-1] - 60, -(-count // 10))
+        ]
     if name in (_OUT, _FOREIGN):
         late = frames[-int(_OUT_M / _SPEED_MPS * _RATE_HZ) :]
-        part = site if name == _OUT else with_aisles(site, _FOREIGN_MAPPED)
-        settings = WHOLE_SITE if name == _OUT else LocalizerSettings()
-        return [resolving_start_at(part, n, WITHIN_M, settings) for n in _spread(late[0], late[-1], count)]
-    part = with_aisles(site, _MAPPED[name])
-    return [start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)]
+        part = site if name == _OUT else aliased_starts.with_aisles(site, _FOREIGN_MAPPED)
+        settings = aliased_starts.WHOLE_SITE if name == _OUT else LocalizerSettings()
+        return [
+            aliased_starts.resolving_start_at(part, n, WITHIN_M, settings) for n in _spread(late[0], late[-1], count)
+        ]
+    part = aliased_starts.with_aisles(site, _MAPPED[name])
+    return [
+        aliased_starts.start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)
+    ]
 
 
 def _site_of(name: str) -> tuple[str, str, int]:
@@ -86,9 +81,9 @@ def _spread(first: int, last: int, count: int) -> list[int]:
     return [int(number) for number in np.linspace(first, last, count)]
 
 
-def judged(name: str, found: list[Start]) -> dict[str, float]:
+def judged(name: str, found: list[aliased_starts.Start]) -> dict[str, float]:
     """The figures of one kind of start."""
-    figures = summary(found, WITHIN_S)
+    figures = aliased_starts.summary(found, WITHIN_S)
     if name == _OUT:
         late_m = [s.late_m for s in found if s.late_m is not None]
         figures["resolved_share"] = len([m for m in late_m if m <= WITHIN_M]) / len(found)
@@ -102,9 +97,9 @@ def judged(name: str, found: list[Start]) -> dict[str, float]:
 @benchmark(KINDS, starts=200, seed=11)
 def main(arguments: Options) -> Results:
     seeds = arguments.seed, arguments.seed + 1
-    found: dict[str, list[Start]] = {name: [] for name in arguments.only}
+    found: dict[str, list[aliased_starts.Start]] = {name: [] for name in arguments.only}
     for seed in seeds:
-        sites = {of: surveyed_site(of[0], seed, *of[1:]) for of in {_site_of(name) for name in found}}
+        sites = {of: aliased_starts.surveyed_site(of[0], seed, *of[1:]) for of in {_site_of(name) for name in found}}
         for name, starts in found.items():
             starts.extend(starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(seeds)), seed))
     figures = {name: judged(name, starts) for name, starts in found.items()}

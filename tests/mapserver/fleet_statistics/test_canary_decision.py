@@ -4,19 +4,11 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from mapserver.fleet_statistics.canary_decision import (
-    ALPHA,
-    CanarySettings,
-    evidence_of_harm,
-    judge_canary,
-    number_of,
-    threshold_for,
-    within_margin,
-)
+from mapserver.fleet_statistics import canary_decision
 from mapserver.fleet_statistics.kpis import Counters, rate
 
 DAY_MS = 57_600_000
-SETTINGS = CanarySettings()
+SETTINGS = canary_decision.CanarySettings()
 
 
 def counts(failures: int, days: float) -> Counters:
@@ -25,16 +17,16 @@ def counts(failures: int, days: float) -> Counters:
 
 def test_robots_are_chosen_as_if_by_lot_and_always_the_same() -> None:
     robots = [f"robot-{n}" for n in range(20_000)]
-    numbers = np.array([number_of("lab", 3, robot) for robot in robots])
+    numbers = np.array([canary_decision.number_of("lab", 3, robot) for robot in robots])
     assert stats.kstest(numbers, "uniform").pvalue > 0.01
-    other = np.array([number_of("lab", 4, robot) for robot in robots])
+    other = np.array([canary_decision.number_of("lab", 4, robot) for robot in robots])
     assert abs(np.corrcoef(numbers, other)[0, 1]) < 0.03
-    assert abs(np.mean(numbers < threshold_for(0.05, "lab", 3, robots)) - 0.05) < 0.005
+    assert abs(np.mean(numbers < canary_decision.threshold_for(0.05, "lab", 3, robots)) - 0.05) < 0.005
     for version in range(20):  # of a small fleet at least one takes part
         few = robots[:6]
-        threshold = threshold_for(0.05, "lab", version, few)
-        assert sum(number_of("lab", version, robot) < threshold for robot in few) >= 1
-    assert threshold_for(0.05, "lab", 3, []) == 0.05
+        threshold = canary_decision.threshold_for(0.05, "lab", version, few)
+        assert sum(canary_decision.number_of("lab", version, robot) < threshold for robot in few) >= 1
+    assert canary_decision.threshold_for(0.05, "lab", 3, []) == 0.05
 
 
 def test_the_posterior_is_the_integral_of_its_definition() -> None:
@@ -44,7 +36,9 @@ def test_the_posterior_is_the_integral_of_its_definition() -> None:
         limit = 1.5 * other_rate + 0.5
         return float(stats.gamma.cdf(limit, 2.5, scale=1 / 3.0) * stats.gamma.pdf(other_rate, 9.5, scale=1 / 60.0))
 
-    assert within_margin(ours, theirs, 1.5, 0.5) == pytest.approx(integrate.quad(inside, 0, 2)[0], abs=2e-3)
+    assert canary_decision.within_margin(ours, theirs, 1.5, 0.5) == pytest.approx(
+        integrate.quad(inside, 0, 2)[0], abs=2e-3
+    )
 
 
 def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at() -> None:
@@ -55,9 +49,11 @@ def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at()
     for _ in range(runs):
         ours, theirs = np.cumsum(rng.poisson(0.1 * 1.5 * 0.6, looks)), np.cumsum(rng.poisson(2.0 * 0.6, looks))
         pairs = enumerate(zip(ours, theirs, strict=True), start=1)
-        evidence = [evidence_of_harm(rate(int(a), 0.1 * n), rate(int(b), 2.0 * n), 1.5) for n, (a, b) in pairs]
-        alarms += max(evidence) >= 1 / ALPHA
-    assert alarms / runs <= ALPHA * 1.5
+        evidence = [
+            canary_decision.evidence_of_harm(rate(int(a), 0.1 * n), rate(int(b), 2.0 * n), 1.5) for n, (a, b) in pairs
+        ]
+        alarms += max(evidence) >= 1 / canary_decision.ALPHA
+    assert alarms / runs <= canary_decision.ALPHA * 1.5
 
 
 @pytest.mark.parametrize(
@@ -74,7 +70,7 @@ def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at()
     ],
 )
 def test_decisions(canary: Counters, others: Counters, days: float, action: str) -> None:
-    finding = judge_canary(canary, others, days, SETTINGS)
+    finding = canary_decision.judge_canary(canary, others, days, SETTINGS)
     assert finding.action == action, finding.reason
     assert "robot-day" in finding.reason
 
@@ -82,4 +78,4 @@ def test_decisions(canary: Counters, others: Counters, days: float, action: str)
 def test_everything_that_speaks_against_a_map_counts() -> None:
     for name in ("failures", "suspected", "docks_wrong", "blind_seen"):
         bad = Counters(driving_ms=DAY_MS, **{name: 9})
-        assert judge_canary(bad, counts(3, 20.0), 0.3, SETTINGS).action == "roll_back", name
+        assert canary_decision.judge_canary(bad, counts(3, 20.0), 0.3, SETTINGS).action == "roll_back", name

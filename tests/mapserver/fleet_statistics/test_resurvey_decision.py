@@ -10,19 +10,12 @@ import pytest
 
 from mapserver import releases
 from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics import resurvey_decision
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters
-from mapserver.fleet_statistics.resurvey_decision import (
-    ResurveySettings,
-    TileConcern,
-    concerns,
-    route,
-    route_csv,
-    route_geojson,
-)
 from mapserver.store import FleetBatch, MapStore
 from support.storage.map_samples import save_sample_draft
 
-SETTINGS = ResurveySettings()
+SETTINGS = resurvey_decision.ResurveySettings()
 
 
 def counts(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int = 0) -> Counters:
@@ -45,7 +38,7 @@ def counts(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int 
 def test_a_tile_is_listed_for_a_reason(now: Counters, then: Counters, words: str) -> None:
     recent = {"0,0": now} | {f"{n},5": counts(1, 40.0) for n in range(10)}
     before = {"0,0": then} | {f"{n},5": counts(5, 280.0) for n in range(10)}
-    found = concerns(recent, before, SETTINGS)
+    found = resurvey_decision.concerns(recent, before, SETTINGS)
     assert [concern.tile for concern in found] == (["0,0"] if words else [])
     assert not words or words in found[0].reasons[0]
 
@@ -56,28 +49,29 @@ def test_chance_alone_lists_almost_nothing() -> None:
     for _ in range(100):
         recent = {f"{n},0": counts(int(rng.poisson(1.0)), 16.0) for n in range(60)}
         before = {f"{n},0": counts(int(rng.poisson(7.0)), 112.0) for n in range(60)}
-        listed += len(concerns(recent, before, SETTINGS))
+        listed += len(resurvey_decision.concerns(recent, before, SETTINGS))
     assert listed <= 3  # of 6000 tiles; alpha is for all tiles of a list together
 
 
 def test_positions_outside_of_all_tiles_are_no_tile() -> None:
-    assert concerns({"outside": counts(50)}, {}, SETTINGS) == []
+    assert resurvey_decision.concerns({"outside": counts(50)}, {}, SETTINGS) == []
 
 
 def test_the_route_goes_to_the_nearest_that_is_left() -> None:
-    (one,) = concerns({"0,0": counts(50), "9,9": counts(0, 400.0)}, {}, SETTINGS)
+    (one,) = resurvey_decision.concerns({"0,0": counts(50), "9,9": counts(0, 400.0)}, {}, SETTINGS)
     found = [one] + [
-        TileConcern(tile, ['=x"\ny'], one.failures, one.failures, None, None) for tile in ("9,0", "1,0", "5,0")
+        resurvey_decision.TileConcern(tile, ['=x"\ny'], one.failures, one.failures, None, None)
+        for tile in ("9,0", "1,0", "5,0")
     ]
     places = {concern.tile: (10.0 * int(concern.tile[0]), 0.0) for concern in found}
-    way = route(found, places)
+    way = resurvey_decision.route(found, places)
     assert [point.tile for point in way] == ["0,0", "1,0", "5,0", "9,0"]
-    rows = [*csv.reader(route_csv(way).splitlines())]
+    rows = [*csv.reader(resurvey_decision.route_csv(way).splitlines())]
     assert len(rows) == 5 and rows[2] == ["2", "10.000", "0.000", "1,0", "'=x\" y"], "no formula of a spreadsheet"
-    document = json.loads(json.dumps(route_geojson("lab", 3, way)))
+    document = json.loads(json.dumps(resurvey_decision.route_geojson("lab", 3, way)))
     assert document["type"] == "FeatureCollection"
     assert document["features"][-1]["geometry"]["coordinates"] == [[0.0, 0.0], [10.0, 0.0], [50.0, 0.0], [90.0, 0.0]]
-    assert len(route_geojson("lab", 3, way[:1])["features"]) == 1
+    assert len(resurvey_decision.route_geojson("lab", 3, way[:1])["features"]) == 1
 
 
 def test_a_store_leads_to_where_the_survey_stood(tmp_path: Path) -> None:

@@ -16,20 +16,10 @@ import cv2
 import numpy as np
 from playwright.sync_api import Page, expect
 
+from fleetmap import messages
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.geometry import se3
 from fleetmap.mapformat.tile import Tile
-from fleetmap.messages import (
-    Cause,
-    FailureReport,
-    FixNote,
-    Placement,
-    PoseMessage,
-    RobotHealth,
-    Thumbnail,
-    encode_message,
-    robot_key,
-)
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, DraftContent, MapStore
@@ -112,7 +102,7 @@ def fill_store(folder: Path) -> None:
         failed = store.begin_job(SITE, "build")
         store.update_job(failed, "failed", "recording tuesday: cameras are swapped", {})
         fleet = Fleet(store)
-        health = RobotHealth(site=SITE, robot="tug-7", stamp_ns=1, version=2, status="TRACKING")
+        health = messages.RobotHealth(site=SITE, robot="tug-7", stamp_ns=1, version=2, status="TRACKING")
         fleet.take_health(SITE, "tug-7", health)
         for report in (
             failure("tug-7", "f1", cause="dark"),
@@ -159,18 +149,20 @@ def picture(words: str, width_px: int = 160) -> bytes:
 
 def failure(
     robot: str, failure_id: str, *, cause: str = "dark", kind: str = "blind", wall_ns: int | None = None
-) -> FailureReport:
+) -> messages.FailureReport:
     """A failure with every field that a robot can report."""
-    place = Placement.of(se3(np.eye(3), np.array([20.0, 6.0, 0.0])))
+    place = messages.Placement.of(se3(np.eye(3), np.array([20.0, 6.0, 0.0])))
     fixes = tuple(
-        FixNote(
+        messages.FixNote(
             stamp_ns=40_000_000_000 + n * 1_000_000_000, status="TRACKING", position_map_m=(15.0 + n, 6.0, 0.0), inliers=40 - n,
             innovation=4.0 + n, refused="" if n < 4 else "too few matches",
         )
         for n in range(5)
     )  # fmt: skip
-    pictures = tuple(Thumbnail(stamp_ns=49_900_000_000, kind=of, jpeg=picture(of)) for of in ("frame", "matches"))
-    return FailureReport(
+    pictures = tuple(
+        messages.Thumbnail(stamp_ns=49_900_000_000, kind=of, jpeg=picture(of)) for of in ("frame", "matches")
+    )
+    return messages.FailureReport(
         site=SITE, robot=robot, id=failure_id, stamp_ns=50_000_000_000, wall_ns=time.time_ns() if wall_ns is None else wall_ns,
         duration_s=3.5, kind=kind, status="LOST", cause=cause, version=2, tile=(1, 0), map_from_base=place, radius_95_m=0.4,
         innovation=31.0, inliers=9, exposure=0.05, sharpness=0.8, fixes=fixes, thumbnails=pictures,
@@ -185,13 +177,13 @@ def place_of(number: int) -> tuple[float, float]:
 def speak(bus: Bus, robot: str, stamp_ns: int, place_m: tuple[float, float], status: str = "TRACKING") -> None:
     """One robot's pose and health."""
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
-    estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
-    bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
-    flags = () if status == "TRACKING" else (Cause.ODOMETRY,)
-    health = RobotHealth(
+    estimate = messages.PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
+    bus.publish(messages.robot_key(SITE, robot, "pose"), messages.encode_message(estimate))
+    flags = () if status == "TRACKING" else (messages.Cause.ODOMETRY,)
+    health = messages.RobotHealth(
         site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, flags=flags, metrics={"speed_mps": 0.8}
     )
-    bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
+    bus.publish(messages.robot_key(SITE, robot, "health"), messages.encode_message(health))
 
 
 @contextmanager

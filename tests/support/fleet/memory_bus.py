@@ -6,16 +6,7 @@ from typing import Any
 import zenoh
 
 from fleetmap.access import Access, Act, Direction, _rules
-from fleetmap.bus.zenoh_bus import (
-    Answer,
-    Bus,
-    Handle,
-    Listen,
-    answer_query,
-    check_size,
-    deliver,
-    no_answer,
-)
+from fleetmap.bus import zenoh_bus
 from fleetmap.errors import LinkError
 
 
@@ -29,8 +20,8 @@ class MemoryHub:
         self.reachable = True
         self.access = access
         self.lock = threading.RLock()
-        self.queryables: list[tuple[str, Answer, str | None]] = []
-        self.subscribers: list[tuple[str, Listen, str | None]] = []
+        self.queryables: list[tuple[str, zenoh_bus.Answer, str | None]] = []
+        self.subscribers: list[tuple[str, zenoh_bus.Listen, str | None]] = []
         self.tokens: list[tuple[str, str | None]] = []
         self.certificates: list[str | None] = []  # of all participants, None for the server
 
@@ -41,7 +32,7 @@ class MemoryHub:
         return permits(self.access, certificate, flow, act, key_expr)
 
 
-class MemoryBus(Bus):
+class MemoryBus(zenoh_bus.Bus):
     """A participant of a MemoryHub; callbacks run on the caller's thread.
 
     As on the network, denied messages are dropped silently: no error, no delivery.
@@ -52,15 +43,15 @@ class MemoryBus(Bus):
     def __init__(self, hub: MemoryHub, certificate: str | None = None) -> None:
         """certificate: its common name; None for the server."""
         self._hub, self._certificate = hub, certificate
-        self._handles: list[Handle] | None = []
+        self._handles: list[zenoh_bus.Handle] | None = []
         hub.certificates.append(certificate)
 
-    def queryable(self, key_expr: str, answer: Answer) -> Handle:
+    def queryable(self, key_expr: str, answer: zenoh_bus.Answer) -> zenoh_bus.Handle:
         return self._declare(self._hub.queryables, (key_expr, answer, self._certificate))
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
         """See Bus; never waits."""
-        check_size(payload, key)
+        zenoh_bus.check_size(payload, key)
         hub, own = self._hub, self._certificate
         with hub.lock:
             answers = [
@@ -73,14 +64,16 @@ class MemoryBus(Bus):
             ]
         may_ask = hub.passes(own, "ingress", "query", key) and hub.passes(own, "egress", "reply", key)
         if not hub.reachable or not answers or not may_ask:
-            raise no_answer(key, self.endpoint, timeout_s, is_silenced=hub.access is not None and own is not None)
-        data, reason = answer_query(answers[0], key, payload)
+            raise zenoh_bus.no_answer(
+                key, self.endpoint, timeout_s, is_silenced=hub.access is not None and own is not None
+            )
+        data, reason = zenoh_bus.answer_query(answers[0], key, payload)
         if data is None:
             raise LinkError(f"{key} was refused: {reason}")
         return data
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
-        check_size(payload, key)
+        zenoh_bus.check_size(payload, key)
         hub = self._hub
         with hub.lock:
             listeners = [
@@ -92,12 +85,12 @@ class MemoryBus(Bus):
             ]
         if hub.reachable and hub.passes(self._certificate, "ingress", "put", key):
             for listen in listeners:
-                deliver(listen, key, payload)
+                zenoh_bus.deliver(listen, key, payload)
 
-    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
+    def subscribe(self, key_expr: str, listen: zenoh_bus.Listen) -> zenoh_bus.Handle:
         return self._declare(self._hub.subscribers, (key_expr, listen, self._certificate))
 
-    def declare_alive(self, key: str) -> Handle:
+    def declare_alive(self, key: str) -> zenoh_bus.Handle:
         return self._declare(self._hub.tokens, (key, self._certificate))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
@@ -129,7 +122,7 @@ class MemoryBus(Bus):
             for handle in handles:
                 handle.close()
 
-    def _declare(self, table: list[Any], entry: Any) -> Handle:
+    def _declare(self, table: list[Any], entry: Any) -> zenoh_bus.Handle:
         if self._handles is None:
             raise LinkError("this bus is closed; open another one")
         with self._hub.lock:
@@ -139,7 +132,7 @@ class MemoryBus(Bus):
             with self._hub.lock:
                 table.remove(entry)
 
-        handle = Handle()
+        handle = zenoh_bus.Handle()
         handle.callback(undo)
         self._handles.append(handle)
         return handle

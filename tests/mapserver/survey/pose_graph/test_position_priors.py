@@ -8,15 +8,9 @@ import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.samples import PositionPrior
+from mapserver.survey.pose_graph import position_priors
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from mapserver.survey.pose_graph.position_priors import (
-    judged_priors,
-    learn_priors,
-    level,
-    placed_by_priors,
-    prior_edges,
-)
 from mapserver.survey.state import OdometryPass, PriorTerm
 
 _AISLE_M = 4.5
@@ -91,9 +85,11 @@ class Survey:
         rng = np.random.default_rng(seed)
         self.edges, odom_from_body, odometry = _graph(rng, bend_rad)
         self.alone = GraphMarginals(odom_from_body, self.edges)
-        self.placed, terms = placed_by_priors(odom_from_body, self.alone, _priors(rng, **how), BASE_FROM_BODY, odometry)
+        self.placed, terms = position_priors.placed_by_priors(
+            odom_from_body, self.alone, _priors(rng, **how), BASE_FROM_BODY, odometry
+        )
         self.graph = GraphMarginals(self.placed, self.edges)
-        self.priors = learn_priors(self.graph, terms)
+        self.priors = position_priors.learn_priors(self.graph, terms)
 
     @property
     def refused(self) -> int:
@@ -102,9 +98,9 @@ class Survey:
     def solved(self) -> tuple[Array, list[bool]]:
         """map_from_body of the pose graph with the priors, and which of these it believes."""
         believed = [term for term in self.priors if term.is_believed]
-        nodes, held = prior_edges(self.placed, believed)
+        nodes, held = position_priors.prior_edges(self.placed, believed)
         found = optimize_pose_graph(nodes, [*self.edges, *held])
-        there = level(se3_inverse(found.map_from_body[-1]), believed[0].map_from_body)
+        there = position_priors.level(se3_inverse(found.map_from_body[-1]), believed[0].map_from_body)
         return there @ found.map_from_body[:-1], (found.loop_weights >= 0.5).tolist()
 
 
@@ -157,7 +153,7 @@ def test_positions_too_near_each_other_give_no_heading() -> None:
             PositionPrior(k * _PERIOD_NS, _truth()[k] @ se3_inverse(BASE_FROM_BODY), np.diag(variances))
             for k in (0, last)
         ]
-        placed, terms = placed_by_priors(odom_from_body, alone, zones, BASE_FROM_BODY, odometry)
+        placed, terms = position_priors.placed_by_priors(odom_from_body, alone, zones, BASE_FROM_BODY, odometry)
         assert len(terms) == count
         assert (placed is odom_from_body) is (count == 0)
 
@@ -195,7 +191,7 @@ def test_of_two_priors_that_contradict_at_one_keyframe_one_is_not_believed() -> 
     aside = reference.map_from_body.copy()
     aside[1, 3] += 5.0
     twice = [reference, PriorTerm(reference.k, aside, reference.information)]
-    assert [term.is_believed for term in learn_priors(survey.graph, twice)] == [True, False]
+    assert [term.is_believed for term in position_priors.learn_priors(survey.graph, twice)] == [True, False]
 
 
 def test_a_prior_beyond_its_own_covariance_is_no_longer_believed() -> None:
@@ -204,7 +200,7 @@ def test_a_prior_beyond_its_own_covariance_is_no_longer_believed() -> None:
     aside = truth[60].copy()
     aside[1, 3] += 0.3
     priors = [PriorTerm(0, truth[0], information), PriorTerm(60, aside, information)]
-    judged, unchanged = judged_priors(priors, truth)
+    judged, unchanged = position_priors.judged_priors(priors, truth)
     assert [term.is_believed for term in judged] == [True, False]
     assert not unchanged
-    assert judged_priors(judged, truth)[1]
+    assert position_priors.judged_priors(judged, truth)[1]
