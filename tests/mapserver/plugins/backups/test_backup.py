@@ -201,7 +201,7 @@ def test_a_clock_that_was_ahead_hides_no_later_snapshot(
     back_up(store, target, keep=1)
     clock.now_ns -= 400 * DAY_NS
     save_sample_draft(store, seed=7)
-    assert target.snapshots() == [back_up(store, target, keep=1).snapshot]
+    assert [back_up(store, target, keep=1).snapshot] == target.snapshots()
     assert restore(target, tmp_path / "new", ADA).versions == 3
 
 
