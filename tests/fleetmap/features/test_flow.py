@@ -25,10 +25,8 @@ def painted(shift_px: tuple[float, float] = (0.0, 0.0), seed: int = 3) -> NDArra
 
 
 def grid(first_px: float, step_px: float) -> Array:
-    columns, rows = np.meshgrid(
-        np.arange(first_px, 160 - first_px, step_px), np.arange(first_px, 120 - first_px, step_px)
-    )
-    return np.column_stack([columns.ravel(), rows.ravel()])
+    sides = (np.arange(first_px, size_px - first_px, step_px) for size_px in (160, 120))
+    return np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
 
 
 @pytest.mark.parametrize("levels", [0, 1, 3])
@@ -58,11 +56,9 @@ def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
 
 def test_nothing_is_found_without_texture_or_outside() -> None:
     plain, pixels = np.full((120, 160), 90, np.uint8), np.array([[80.0, 60.0], [20.0, 20.0]])
-    _, found = core.follow_pixels(plain, painted(), pixels, pixels, 7, 1, *UNCHECKED)
-    assert not found.any()
-    far = np.array([[500.0, 60.0], [20.0, -90.0]])
-    _, found = core.follow_pixels(painted(), painted(), pixels, far, 7, 1, *UNCHECKED)
-    assert not found.any()
+    for before, there in ((plain, pixels), (painted(), np.array([[500.0, 60.0], [20.0, -90.0]]))):
+        _, found = core.follow_pixels(before, painted(), pixels, there, 7, 1, *UNCHECKED)
+        assert not found.any()
 
 
 def test_what_went_wrong_does_not_lead_back() -> None:

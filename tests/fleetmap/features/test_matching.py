@@ -83,9 +83,8 @@ def test_projection_is_brute_force(seed: int) -> None:
     span = np.column_stack([low, low + rng.integers(0, 5, len(a))])
     pixels = rng.uniform(0.0, [320.0, 240.0], (len(b), 2))
     octaves = rng.integers(0, 8, len(b)).astype(np.int8)
-    index, distance = match_by_projection(
-        Projected(predicted, radius, a, span), features_of(pixels, octaves, b), 90, 0.9
-    )
+    features = features_of(pixels, octaves, b)
+    index, distance = match_by_projection(Projected(predicted, radius, a, span), features, 90, 0.9)
     wanted = _projection_twin(predicted, radius, a, span, pixels, octaves, b, 90, 0.9)
     np.testing.assert_array_equal(index, wanted)
     matched = index >= 0
@@ -112,6 +111,5 @@ def test_packing_read_only_and_unaligned_bytes() -> None:
     stored = np.random.default_rng(2).integers(0, 256, 1 + 10 * 32, dtype=np.uint8).tobytes()
     descriptors = np.frombuffer(stored, np.uint8, offset=1).reshape(10, 32)
     words = packed(descriptors)
-    assert words.flags.writeable
-    assert words.flags.aligned
+    assert words.flags.writeable and words.flags.aligned
     np.testing.assert_array_equal(words.view(np.uint8).reshape(10, 32), descriptors)

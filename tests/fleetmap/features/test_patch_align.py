@@ -7,7 +7,7 @@ from fleetmap import core
 from fleetmap.features import orb
 from fleetmap.features.patch_align import Patches, half_pyramid, refine_matches
 from fleetmap.features.settings import AlignSettings
-from fleetmap.geometry import Array, transform_points
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smooth_texture
 
@@ -31,16 +31,12 @@ def warped_pair(texture: Texture, current_from_reference: Array, gain: float = 1
 
 
 def similarity(scale: float, angle_deg: float) -> Array:
-    turn = np.radians(angle_deg)
-    return scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return scale * so3_exp(np.radians([0.0, 0.0, angle_deg]))[:2, :2]
 
 
 def motion(scale: float, angle_deg: float) -> Array:
     """current_from_reference (4, 4) of a camera that turns about its axis and goes ahead: pictures of what is 4 m ahead are similar."""
-    moved = np.eye(4)
-    moved[:2, :2] = similarity(1.0, angle_deg)
-    moved[2, 3] = 4.0 / scale - 4.0
-    return moved
+    return se3(so3_exp(np.radians([0.0, 0.0, angle_deg])), np.array([0.0, 0.0, 4.0 / scale - 4.0]))
 
 
 def ahead(pixels: Array) -> Array:
@@ -48,15 +44,13 @@ def ahead(pixels: Array) -> Array:
     return np.column_stack([(pixels - CENTRE) * 4.0 / 300.0, np.full(len(pixels), 4.0)])
 
 
+Moved = tuple[Array, Array] | None  # points (N, 3) and the motion, if known
+
+
 def aligned(
-    before: Array,
-    pixels: Array,
-    now: Array,
-    start: Array,
-    moved: tuple[Array, Array] | None,
-    found: tuple[int, float] = (0, 0.0),
+    before: Array, pixels: Array, now: Array, start: Array, moved: Moved, found: tuple[int, float] = (0, 0.0)
 ) -> Array:
-    """(N, 3) places in the picture now, from a start, of what was at pixels before; moved: points (N, 3) and the motion, if known.
+    """(N, 3) places in the picture now, from a start, of what was at pixels before.
 
     found: octave and angle of all features now; before both are 0.
     """
@@ -109,10 +103,7 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
 
 
 CAMERA = StereoCamera(300.0, 160.0, 120.0, 0.1, WIDTH, HEIGHT)
-WALL = (
-    np.array([0.0, 0.0, 4.0]),
-    np.array([np.sin(np.radians(25.0)), 0.0, np.cos(np.radians(25.0))]),
-)  # a point of it, its direction
+WALL = np.array([0.0, 0.0, 4.0]), so3_exp(np.radians([0.0, 25.0, 0.0]))[:, 2]  # a point of it, its direction
 
 
 def places_on_wall(pixels: Array, reference_from_cam: Array) -> tuple[Array, Array]:
@@ -130,16 +121,14 @@ def test_a_wall_along_the_way_does_not_draw_patches_back() -> None:
     """A robot drives 1.2 m towards what it sees of a wall, at 25 degrees. Taken to face it, its patches lay up to a pixel behind."""
     texture = smooth_texture(np.random.default_rng(13), shortest_px=12.0)
     u, v = pixel_grid(WIDTH, HEIGHT)
-    reference_from_current = np.eye(4)
-    reference_from_current[2, 3] = 1.2
-    grey = []
+    reference_from_current, grey = se3(np.eye(3), np.array([0.0, 0.0, 1.2])), []
     for reference_from_cam in (np.eye(4), reference_from_current):
         places = places_on_wall(np.stack([u, v], -1), reference_from_cam)[1]
         grey.append(picture(texture, 32.0 * places[..., 0], 75.0 * places[..., 1]))
     pixels = core.spread_corners(grey[0], 300, 8.0, 12, 60, NOTHING)[0].astype(np.float64)
     pixels = pixels[(np.abs(pixels - CENTRE) < 60).all(axis=1)]
     points = places_on_wall(pixels, np.eye(4))[0]
-    current_from_reference = np.linalg.inv(reference_from_current)
+    current_from_reference = se3_inverse(reference_from_current)
     expected = CAMERA.pixel_from_point(transform_points(current_from_reference, points))[:, :2]
     found = aligned(grey[0], pixels, grey[1], expected + 0.5, (points, current_from_reference))
     error = np.linalg.norm(found[:, :2] - expected, axis=1)

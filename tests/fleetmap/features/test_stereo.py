@@ -64,21 +64,17 @@ def test_a_repeated_pattern_is_refused(texture: Texture) -> None:
 
 def test_unrelated_pictures_give_little(texture: Texture) -> None:
     u, v = pixel_grid(WIDTH, HEIGHT)
-    other = smooth_texture(np.random.default_rng(99))
-    frame = RectifiedFrame(0, picture(texture, u, v), picture(other, u, v), None)
+    frame = RectifiedFrame(0, *(picture(of, u, v) for of in (texture, smooth_texture(np.random.default_rng(99)))), None)
     found = disparities(frame, CAMERA, corners(frame), SETTINGS)
     assert np.isfinite(found[:, 0]).mean() < 0.06
 
 
 def test_sigmas_follow_the_noise(texture: Texture) -> None:
     """Normalised errors under 3 grey values of noise are of order one."""
-    rng = np.random.default_rng(3)
     frame = plane_pair(texture, 9.7)
-    assert frame.right is not None
-    noisy = [
-        np.clip(np.rint(i + rng.normal(0, 3, i.shape)), 0, 255).astype(np.uint8) for i in (frame.left, frame.right)
-    ]
-    found = disparities(RectifiedFrame(0, noisy[0], noisy[1], None), CAMERA, corners(frame), SETTINGS)
+    both = np.stack([frame.left, frame.right])
+    noisy = np.clip(np.rint(both + np.random.default_rng(3).normal(0, 3, both.shape)), 0, 255).astype(np.uint8)
+    found = disparities(RectifiedFrame(0, *noisy, None), CAMERA, corners(frame), SETTINGS)
     normalised = (found[:, 0] - 9.7) / found[:, 1]
     assert 0.4 < np.nanmedian(np.abs(normalised)) / 0.6745 < 1.6
 

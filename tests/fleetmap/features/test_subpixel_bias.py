@@ -66,7 +66,6 @@ def _check(found: Array) -> None:
 def test_disparities_patches_and_flow_are_right_whatever_the_camera_makes_of_it(name: str) -> None:
     frame = process_frame(CameraFrame(7, LEFT, RIGHT), IMAGE_PIPELINES[name], 3)
     left, right = frame.left, frame.right
-    assert right is not None
     _check(stereo.disparities(RectifiedFrame(0, left, right, None), CAMERA, PIXELS, StereoSettings())[:, 0])
     there = np.column_stack([PIXELS[:, 0] - np.rint(TRUE), PIXELS[:, 1]])
     points, right_from_left = CAMERA.point_from_pixel(PIXELS, TRUE), np.eye(4)

@@ -11,6 +11,7 @@ from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, predicted, sample_motion
 
 NOISE = ImuNoise()
+ZERO = np.zeros(3)
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.05, 0.08])
 
 
@@ -60,15 +61,15 @@ def test_covariance_is_that_of_noisy_runs() -> None:
     """800 noisy realisations with walking biases: their scatter, motion and biases together, is the covariance."""
     rng = np.random.default_rng(5)
     clean = sample_motion(rate_hz=100.0, duration_s=2.0)
-    noise, zero = ImuNoise(2e-3, 4e-3, 2e-2, 5e-2), np.zeros(3)
-    nominal = preintegrate(clean, 0, 2_000_000_000, zero, zero, noise)
+    noise = ImuNoise(2e-3, 4e-3, 2e-2, 5e-2)
+    nominal = preintegrate(clean, 0, 2_000_000_000, ZERO, ZERO, noise)
     errors = []
     for _ in range(800):
         walk = np.cumsum(rng.normal(size=(len(clean), 6)) * 0.1, axis=0)  # sqrt(dt) of 10 ms
         white = rng.normal(size=(len(clean), 6)) * 10.0
         gyro = clean.gyro_radps - noise.gyro_walk_radps2_rthz * walk[:, :3] - noise.gyro_noise_radps_rthz * white[:, :3]
         accel = clean.accel_mps2 - noise.accel_walk_mps3_rthz * walk[:, 3:] - noise.accel_noise_mps2_rthz * white[:, 3:]
-        run = preintegrate(ImuSamples(clean.stamps_ns, gyro, accel), 0, 2_000_000_000, zero, zero, noise)
+        run = preintegrate(ImuSamples(clean.stamps_ns, gyro, accel), 0, 2_000_000_000, ZERO, ZERO, noise)
         bias = np.concatenate([noise.gyro_walk_radps2_rthz * walk[-1, :3], noise.accel_walk_mps3_rthz * walk[-1, 3:]])
         turned = so3_log(nominal.delta_rotation.T @ run.delta_rotation)
         moved = [run.delta_velocity_mps - nominal.delta_velocity_mps, run.delta_position_m - nominal.delta_position_m]
@@ -85,9 +86,8 @@ def test_missing_samples_are_told_and_widen_the_covariance() -> None:
     whole = sample_motion(rate_hz=200.0, duration_s=3.0)
     kept = (whole.stamps_ns < 800_000_000) | (whole.stamps_ns > 2_000_000_000)
     holed = ImuSamples(whole.stamps_ns[kept], whole.gyro_radps[kept], whole.accel_mps2[kept])
-    zero = np.zeros(3)
-    healthy = preintegrate(whole, 0, 2_900_000_000, zero, zero, NOISE)
-    damaged = preintegrate(holed, 0, 2_900_000_000, zero, zero, NOISE)
+    healthy = preintegrate(whole, 0, 2_900_000_000, ZERO, ZERO, NOISE)
+    damaged = preintegrate(holed, 0, 2_900_000_000, ZERO, ZERO, NOISE)
     assert healthy.max_gap_s == pytest.approx(0.005)
     assert damaged.max_gap_s == pytest.approx(1.21, abs=0.011)
     moved = damaged.delta_position_m - healthy.delta_position_m
@@ -97,10 +97,9 @@ def test_missing_samples_are_told_and_widen_the_covariance() -> None:
 
 def test_short_of_data_at_the_ends() -> None:
     imu = sample_motion(rate_hz=200.0, duration_s=1.0)
-    zero = np.zeros(3)
-    inside = preintegrate(imu, 0, 1_000_000_000, zero, zero, NOISE)
-    a_little = preintegrate(imu, 0, 1_004_000_000, zero, zero, NOISE)
-    much = preintegrate(imu, 0, 1_500_000_000, zero, zero, NOISE)
+    inside = preintegrate(imu, 0, 1_000_000_000, ZERO, ZERO, NOISE)
+    a_little = preintegrate(imu, 0, 1_004_000_000, ZERO, ZERO, NOISE)
+    much = preintegrate(imu, 0, 1_500_000_000, ZERO, ZERO, NOISE)
     assert a_little.max_gap_s == pytest.approx(0.005)
     assert np.trace(a_little.cov) < 1.1 * np.trace(inside.cov)
     assert much.max_gap_s == pytest.approx(0.5)
@@ -108,16 +107,15 @@ def test_short_of_data_at_the_ends() -> None:
 
 
 def test_no_data_at_all() -> None:
-    zero = np.zeros(3)
-    nothing = preintegrate(ImuSamples.empty(), 0, 500_000_000, zero, zero, NOISE)
+    nothing = preintegrate(ImuSamples.empty(), 0, 500_000_000, ZERO, ZERO, NOISE)
     assert nothing.max_gap_s == pytest.approx(0.5)
     np.testing.assert_allclose(nothing.delta_rotation, np.eye(3))
     assert nothing.cov[3, 3] > (0.5 * 9.81) ** 2
-    at_once = preintegrate(ImuSamples.empty(), 7, 7, zero, zero, NOISE)
+    at_once = preintegrate(ImuSamples.empty(), 7, 7, ZERO, ZERO, NOISE)
     assert at_once.dt_s == 0.0
     assert np.isfinite(at_once.cov).all()
     single = ImuSamples(np.array([5_000_000]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]]))
-    held = preintegrate(single, 0, 10_000_000, zero, zero, NOISE)
+    held = preintegrate(single, 0, 10_000_000, ZERO, ZERO, NOISE)
     np.testing.assert_allclose(held.delta_velocity_mps, [0, 0, 0.0981], rtol=1e-9)
 
 

@@ -8,7 +8,7 @@ from fleetmap import core
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import packed
 from fleetmap.relocalization.map_view import DescriptorIndex
-from support.worlds.vocabulary_training import train_vocabulary
+from support.worlds.vocabulary_training import changed, train_vocabulary
 
 Descriptors = NDArray[np.uint8]
 
@@ -16,12 +16,6 @@ Descriptors = NDArray[np.uint8]
 def distances(a: Descriptors, b: Descriptors) -> NDArray[np.int64]:
     """(A, B) bits that differ, by numpy alone."""
     return np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2, dtype=np.int64)
-
-
-def changed(descriptors: Descriptors, bits: int, rng: np.random.Generator) -> Descriptors:
-    """Each with so many of its bits changed."""
-    flips = np.argsort(rng.random((len(descriptors), 256)), axis=1) < bits
-    return descriptors ^ np.packbits(flips, axis=1)
 
 
 def vocabulary(descriptors: Descriptors, branching: int = 10, levels: int = 4) -> Vocabulary:

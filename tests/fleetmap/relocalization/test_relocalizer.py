@@ -1,6 +1,7 @@
 """Which places of a map the relocalizer tries for a frame of a robot that does not know its place, and what several frames may prove."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -75,17 +76,12 @@ def test_several_frames_prove_a_place_only_where_pose_and_motion_are_known(
     monkeypatch: pytest.MonkeyPatch, sigma_m: float, motion_m: float, recall: float, frames: int
 ) -> None:
     """Else what looks a little like it, as the next bay does, would agree in one frame after the other."""
-    counted = [0]
-
-    def by_projection(_: Relocalizer, query: object, place: Array, radius: float, earlier: list[EarlierFrame]) -> Fix:
-        counted[0] = len(earlier)
-        return Fix(place, np.eye(6), 20, 9, landmark_recall=recall)
-
-    monkeypatch.setattr(Relocalizer, "by_projection", by_projection)
+    asked = Mock(side_effect=lambda query, place, *_: Fix(place, np.eye(6), 20, 9, landmark_recall=recall))
+    monkeypatch.setattr(Relocalizer, "by_projection", asked)
     view, moved = line_of_places(), np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
     relocalizer = Relocalizer(view, CAMERA, RelocalizerSettings())
     nothing, amid = FrameFeatures(Features.empty(), np.zeros((0, 3))), se3(np.eye(3), view.points_map.mean(axis=0))
     earlier = [EarlierFrame(nothing, np.eye(4), m**2 * moved) for m in (0.01, motion_m)]
     fix = relocalizer.near(nothing, amid, sigma_m**2 * moved, earlier)
-    assert (0 if fix is None else counted[0]) == frames
+    assert (0 if fix is None else len(asked.call_args.args[3])) == frames
     assert relocalizer.near(nothing, se3(np.eye(3), np.full(3, 1e4)), 1e-4 * moved) is None, "nothing is in view"

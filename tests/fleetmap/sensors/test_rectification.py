@@ -24,15 +24,14 @@ LENSES = {
 }
 
 
-def rig(model: str, cam0_from_cam1: Array | None = None) -> RigCalibration:
+APART = se3(so3_exp(np.array([0.02, -0.03, 0.015])), np.array([0.11, 0.004, -0.003]))
+
+
+def rig(model: str, cam0_from_cam1: Array = APART) -> RigCalibration:
     """Two unlike cameras, turned against each other by 2 degrees, 0.11 m apart and not quite side by side."""
-    placed = se3(so3_exp(np.array([0.02, -0.03, 0.015])), np.array([0.11, 0.004, -0.003]))
-    placed = placed if cam0_from_cam1 is None else cam0_from_cam1
-    distortion = LENSES[model]
-    left = CameraCalibration(model, WIDTH, HEIGHT, np.array([200.0, 201.0, 158.0, 122.0]), distortion, BODY_FROM_CAM0)
-    right = CameraCalibration(
-        model, WIDTH, HEIGHT, np.array([205.0, 204.0, 163.0, 117.0]), 0.9 * distortion, BODY_FROM_CAM0 @ placed
-    )
+    pinholes, lens = np.array([[200.0, 201.0, 158.0, 122.0], [205.0, 204.0, 163.0, 117.0]]), LENSES[model]
+    left = CameraCalibration(model, WIDTH, HEIGHT, pinholes[0], lens, BODY_FROM_CAM0)
+    right = CameraCalibration(model, WIDTH, HEIGHT, pinholes[1], 0.9 * lens, BODY_FROM_CAM0 @ cam0_from_cam1)
     return RigCalibration((left, right))
 
 
@@ -42,14 +41,15 @@ def points_in_view(rng: np.random.Generator, count: int) -> Array:
     return np.column_stack([sideways, depth])
 
 
+UV = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1)
+
+
 def dot(pixel: Array) -> Image:
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    return np.rint(250 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / (2 * 1.5**2))).astype(np.uint8)
+    return np.rint(250 * np.exp(-((UV - pixel) ** 2).sum(axis=-1) / (2 * 1.5**2))).astype(np.uint8)
 
 
 def centre(image: Image) -> Array:
-    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    return np.array([(u * image.astype(float)).sum(), (v * image.astype(float)).sum()]) / image.sum()
+    return (UV * image[..., None].astype(float)).sum(axis=(0, 1)) / image.sum()
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -60,11 +60,9 @@ def test_dots_appear_where_the_rectified_pair_says(model: str) -> None:
     errors = []
     for point in points_in_view(np.random.default_rng(1), 30):
         point_body = transform_points(rectifier.body_from_cam, point[None])
-        left, right = (
-            c.pixel_from_ray(transform_points(se3_inverse(c.body_from_cam), point_body))[0] for c in calibration.cameras
-        )
-        frame = rectifier.rectify(CameraFrame(0, dot(left), dot(right)))
-        assert frame.right is not None
+        rays = (transform_points(se3_inverse(camera.body_from_cam), point_body) for camera in calibration.cameras)
+        seen = (camera.pixel_from_ray(ray)[0] for camera, ray in zip(calibration.cameras, rays, strict=True))
+        frame = rectifier.rectify(CameraFrame(0, *map(dot, seen)))
         expected = rectifier.camera.pixel_from_point(point[None])[0]
         errors.append([*(centre(frame.left) - expected[:2]), *(centre(frame.right) - expected[[2, 1]])])
     assert np.abs(errors).max() < 0.07
@@ -102,9 +100,7 @@ def test_a_rig_that_is_rectified_already_keeps_its_pictures() -> None:
     rectifier = Rectifier(RigCalibration((pinhole, second)))
     left, right = dot(np.array([100.0, 50.0])), dot(np.array([80.0, 50.0]))
     frame = rectifier.rectify(CameraFrame(7, left, right))
-    assert frame.left is left
-    assert frame.right is right
-    assert frame.stamp_ns == 7
+    assert (frame.left is left, frame.right is right, frame.stamp_ns) == (True, True, 7)
     np.testing.assert_array_equal(rectifier.body_from_cam, np.eye(4))
 
 

@@ -6,21 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from securesystemslib.signer import CryptoSigner
-from tuf.api.metadata import (
-    DelegatedRole,
-    Delegations,
-    Metadata,
-    MetaFile,
-    Root,
-    Signed,
-    Snapshot,
-    TargetFile,
-    Targets,
-    Timestamp,
-)
+from tuf.api import metadata as tuf
 
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UntrustedError
 from fleetmap.mapformat.names import sha256_hex
@@ -50,15 +40,16 @@ class ListPublisher:
 
     def __init__(self) -> None:
         self.keys = {role: [CryptoSigner.generate_ed25519()] for role in (*TOP, ROLE)}
-        self.root = Root(expires=days(700), consistent_snapshot=True)
+        self.root = tuf.Root(expires=days(700), consistent_snapshot=True)
         for role in TOP:
             self.root.add_key(self.keys[role][0].public_key, role)
-        names = DelegatedRole(ROLE, [], 1, terminating=True, paths=[manifest_target(SITE, "*")])
-        self.targets = Targets(expires=days(300), delegations=Delegations(keys={}, roles={ROLE: names}))
+        names = tuf.DelegatedRole(ROLE, [], 1, terminating=True, paths=[manifest_target(SITE, "*")])
+        self.targets = tuf.Targets(expires=days(300), delegations=tuf.Delegations(keys={}, roles={ROLE: names}))
         self.targets.add_key(self.keys[ROLE][0].public_key, ROLE)
-        self.site = Targets(expires=days(14))
-        self.snapshot = Snapshot(expires=days(7), meta={"targets.json": MetaFile(1), f"{ROLE}.json": MetaFile(1)})
-        self.timestamp = Timestamp(expires=days(1))
+        self.site = tuf.Targets(expires=days(14))
+        named = {f"{role}.json": tuf.MetaFile(1) for role in ("targets", ROLE)}
+        self.snapshot = tuf.Snapshot(expires=days(7), meta=named)
+        self.timestamp = tuf.Timestamp(expires=days(1))
         self.files: dict[str, bytes] = {}
         self.asked: list[str] = []
         self.admit(1)
@@ -69,7 +60,7 @@ class ListPublisher:
         self.asked.append(name)
         return self.files.get(name)
 
-    def signed(self, role: str) -> Signed:
+    def signed(self, role: str) -> tuf.Signed:
         return self.site if role == ROLE else getattr(self, role)
 
     def file(self, role: str) -> str:
@@ -80,14 +71,14 @@ class ListPublisher:
         """The last one is current, the others were before."""
         self.site.targets.clear()
         for version in versions:
-            target = TargetFile.from_data(manifest_target(SITE, version), b"manifest %d" % version, ["sha256"])
+            target = tuf.TargetFile.from_data(manifest_target(SITE, version), b"manifest %d" % version, ["sha256"])
             state = "current" if version == versions[-1] else "previous"
             target.unrecognized_fields["custom"] = {"version": version, "state": state, "vocabulary": "0" * 64}
             self.site.targets[target.path] = target
 
     def write(self, role: str, change: Callable[[bytes], bytes] = lambda data: data) -> None:
         """Signs a role as it is and puts it among the files."""
-        metadata = Metadata(self.signed(role))
+        metadata = tuf.Metadata(self.signed(role))
         for key in self.keys[role]:
             metadata.sign(key, append=True)
         self.files[self.file(role)] = change(metadata.to_bytes())
@@ -95,9 +86,9 @@ class ListPublisher:
     def name(self, role: str) -> None:
         """Lets snapshot or timestamp name what a role is now, unsigned yet."""
         if role in ("targets", ROLE):
-            self.snapshot.meta[f"{role}.json"] = MetaFile(self.signed(role).version)
+            self.snapshot.meta[f"{role}.json"] = tuf.MetaFile(self.signed(role).version)
         elif role == "snapshot":
-            self.timestamp.snapshot_meta = MetaFile(self.snapshot.version)
+            self.timestamp.snapshot_meta = tuf.MetaFile(self.snapshot.version)
 
     def publish(self, *roles: str) -> None:
         """The next version of these roles, each named by the one above, in the order of the arguments."""
@@ -142,7 +133,7 @@ class ListReader:
 
     def number(self, role: str) -> int | None:
         path = self.folder / f"{role}.json"
-        return Metadata.from_file(str(path)).signed.version if path.is_file() else None
+        return tuf.Metadata.from_file(str(path)).signed.version if path.is_file() else None
 
 
 @pytest.fixture
@@ -276,7 +267,7 @@ def test_large_sites_and_old_robots_fit(publisher: ListPublisher, robot: ListRea
     roles = publisher.targets.delegations.roles
     for number in range(100):
         name, keys = f"site-place-{number:056d}", list(roles[ROLE].keyids)
-        roles[name] = DelegatedRole(name, keys, 1, terminating=True, paths=[f"{number}/*/m"])
+        roles[name] = tuf.DelegatedRole(name, keys, 1, terminating=True, paths=[f"{number}/*/m"])
     publisher.renew("targets")
     for _ in range(199):
         publisher.publish("root")
@@ -286,22 +277,15 @@ def test_large_sites_and_old_robots_fit(publisher: ListPublisher, robot: ListRea
 
 def test_over_a_bus_answers_without_end_and_refusals_are_told(publisher: ListPublisher, tmp_path: Path) -> None:
     """More bytes behind every answer, or one byte in each."""
-    asked, hub = [], MemoryHub()
-
-    def drip(key: str, _: bytes) -> bytes:
-        asked.append(key)
-        return encode_message(Part(total_bytes=1 << 40, offset=0, data=b"x"))
-
-    def refuse(key: str, _: bytes) -> bytes:
-        raise LinkError("not now")
-
+    drip = Mock(return_value=encode_message(Part(total_bytes=1 << 40, offset=0, data=b"x")))
+    hub, refuse = MemoryHub(), Mock(side_effect=LinkError("not now"))
     with MemoryBus(hub) as server, MemoryBus(hub) as bus:
         for answer, said in ((drip, "size: "), (refuse, "not now")):
             handle = server.queryable(robot_key("*", "*", "trust/*"), answer)
             robot = ListReader(tmp_path / said, ask_over(bus, SITE, "r1", 0.3), publisher.files["1.root.json"])
             assert said in robot.refused()
             handle.close()
-    assert len(asked) == 1
+    assert drip.call_count == 1
 
 
 # -------------------------------------------------------------------------------------------------------- roots and first use
@@ -348,10 +332,8 @@ def test_first_use_pins_the_root(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     assert ListReader(tmp_path, first.ask, None).refused() == ""
     assert "first use" in caplog.text
     refused = ListReader(tmp_path, other.ask, None).refused()
-    assert refused.startswith(SIGNATURE)
-    assert refused.endswith(
-        f"if the server's store was recreated, remove {tmp_path}; else another server replies instead"
-    )
+    says = f"if the server's store was recreated, remove {tmp_path}; else another server replies instead"
+    assert refused.startswith(SIGNATURE) and refused.endswith(says)
     # The control: whoever comes first is believed.
     assert ListReader(tmp_path / "fresh", other.ask, None).refused() == ""
 
@@ -359,7 +341,7 @@ def test_first_use_pins_the_root(tmp_path: Path, caplog: pytest.LogCaptureFixtur
 def test_silence_is_no_end_of_the_roots(robot: ListReader) -> None:
     """Nobody answers: nothing new, not even by what is on the disk, and the next question works again."""
     assert robot.refused() == ""
-    robot.trust._ask = lambda name: (_ for _ in ()).throw(UnreachableError("no reply"))
+    robot.trust._ask = Mock(side_effect=UnreachableError("no reply"))
     robot.trust.refresh()
     with pytest.raises(UnreachableError):
         robot.trust.admitted(wanted(1))

@@ -109,6 +109,12 @@ def cluster(bits: Packed, centres: Packed, iterations: int) -> Indices:
     return labels
 
 
+def changed(descriptors: Descriptors, bits: int, rng: np.random.Generator) -> Descriptors:
+    """Each with so many of its bits changed."""
+    flips = np.argsort(rng.random((len(descriptors), 256)), axis=1) < bits
+    return descriptors ^ np.packbits(flips, axis=1)
+
+
 def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
     """Encode a vocabulary; equal vocabularies give equal bytes on every machine."""
     nodes = len(vocabulary.child_count)
