@@ -10,13 +10,14 @@ import numpy as np
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
 from fleetmap.mapformat.tile import TILE_FORMAT, decode_tile, encode_tile
 from fleetmap.mapformat.version_file import EXPORT_FORMAT
-from fleetmap.messages import FailureReport, Thumbnail
+from fleetmap.messages import Thumbnail
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.quality.figures import Comparison, Evidence, ProbeFigures, TrajectoryBreaks
 from mapserver.store import DraftContent, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive
+from support.fleet.reports import blindness
 from support.storage.dense_samples import surfel_extras, wall
 from support.storage.map_samples import draft_details, random_survey, random_tile
 
@@ -45,10 +46,7 @@ def write_store(folder: Path) -> None:
         store.record_robot_report("lab", "r1", {"status": "TRACKING"}, 1)
         releases.roll_back(store, "lab")
         store.update_job(store.begin_job("lab", "nightly"), "done", "version 2 is published", {"drafts": 1})
-        report = FailureReport(
-            site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
-            version=1, tile=(0, 0), thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8jpeg\xff\xd9"),),
-        )  # fmt: skip
+        report = blindness(tile=(0, 0), thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8jpeg\xff\xd9"),))
         Fleet(store, clock_ns=lambda: 1_767_323_045_000_000_000).take_failure("lab", "r1", report)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, tool
 from fleetmap.encoding import to_json
-from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
+from fleetmap.mapformat.building import Building, FloorEntry
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.tum import format_tum
 from fleetmap.sensors.rectification import Rectifier
@@ -35,10 +35,10 @@ from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
 from mapserver.fleet.building import keep_building
-from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore
 from support.recordings.hashes import hashed, tiles_of
 from support.recordings.realdata import DATA
+from support.storage.map_samples import align
 
 RIGS = {"stereo": "pair", "front-rear": "front-rear", "front-depth": "front-depth"}
 REAL = {"rgbd": ("7scenes_redkitchen_200", "rgbd"), "mono-inertial": ("euroc_mh01_start", "mono-inertial")}
@@ -66,14 +66,7 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
     """The estimates of a robot of the lower floor that drives on the upper one."""
     with MapStore.open(store) as maps:
         for site in ("low", "high"):
-            aligned = Alignment(
-                frame=BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0),
-                metres_per_unit=1.0,
-                method="pins",
-                plan=None,
-                off_m={},
-            )
-            maps.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
+            align(maps, site)
         floors = tuple(FloorEntry(site=site, level=site, height_m=4.0 * n) for n, site in enumerate(("low", "high")))
         keep_building(maps, Building(name="tower", floors=floors), NOBODY)
     own = LocalMapSource(store, "low")

@@ -27,7 +27,7 @@ from fleetmap.mapformat.building import (
 from fleetmap.messages import RobotHealth, encode_message, robot_key
 from mapserver.cli import app
 from mapserver.fleet.building import floors_of, forget_alignment, keep_areas, keep_building
-from mapserver.floor_plan.alignment import Alignment, encode_alignment
+from mapserver.floor_plan.alignment import encode_alignment
 from mapserver.releases import publish
 from mapserver.store import NOBODY, MapStore
 from mapserver.trust.signing import admitted_versions
@@ -35,7 +35,7 @@ from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import serving
 from support.recordings.realdata import real_data
 from support.room_site import run
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import align, save_sample_draft
 from support.waiting import eventually
 
 HERE = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)
@@ -56,9 +56,7 @@ def house(tmp_path: Path) -> Path:
             save_sample_draft(store, site=site)
             publish(store, site)
             if site != "yard":
-                frame = BuildingFrame(x_m=10.0 * number, y_m=0.0, yaw_rad=0.0)
-                aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
-                store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
+                align(store, site, 10.0 * number)
                 keep_areas(store, site, areas("A"), "", NOBODY)
         save_sample_draft(store, site="draft")
     return tmp_path

@@ -7,13 +7,14 @@ deterministic. Rotations are about the axes of the left camera (x right, y down,
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.recordings import Recording
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, png_image
+from fleetmap.recordings.images import StoredImage, decode_grey, png_image
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from support.recordings.spoiled_recording import with_frames
 
@@ -56,25 +57,17 @@ def baseline(percent: float) -> RigFault:
 def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
     """Focal lengths too large by a percentage, of all cameras or of those with the numbers `cameras`."""
     chosen = None if cameras is None else set(cameras)
-
-    def scaled(camera: CameraCalibration) -> CameraCalibration:
-        return replace(camera, intrinsics_px=camera.intrinsics_px * [1 + 0.01 * percent, 1 + 0.01 * percent, 1, 1])
-
-    def change(rig: RigCalibration) -> RigCalibration:
-        return _with_cameras(rig, scaled, chosen)
-
+    by = np.array([1 + 0.01 * percent, 1 + 0.01 * percent, 1, 1])
     kind = "focal" if chosen is None else "focal of cam" + ",".join(map(str, sorted(chosen)))
-    return RigFault(kind, percent, "%", change)
+    scaled = partial(_with_cameras, lambda c: replace(c, intrinsics_px=c.intrinsics_px * by), chosen)
+    return RigFault(kind, percent, "%", scaled)
 
 
 def pair_turn(axis: str, degrees: float) -> RigFault:
     """A wrong rotation of the right camera against the left one (a key of AXES, the right camera's own axes)."""
     turn = se3(_rotation(AXES[axis], degrees), np.zeros(3))
-
-    def change(rig: RigCalibration) -> RigCalibration:
-        return _with_cameras(rig, lambda c: replace(c, body_from_cam=c.body_from_cam @ turn), {1})
-
-    return RigFault(f"pair {axis}", degrees, "deg", change)
+    turned = partial(_with_cameras, lambda c: replace(c, body_from_cam=c.body_from_cam @ turn), {1})
+    return RigFault(f"pair {axis}", degrees, "deg", turned)
 
 
 def camera_imu_turn(axis: str, degrees: float) -> RigFault:
@@ -85,18 +78,15 @@ def camera_imu_turn(axis: str, degrees: float) -> RigFault:
         turn = axes @ _rotation(AXES[axis], degrees) @ axes.T
         centre = rig.cameras[0].body_from_cam[:3, 3]
         about_left = se3(turn, centre - turn @ centre)
-        return _with_cameras(rig, lambda c: replace(c, body_from_cam=about_left @ c.body_from_cam), None)
+        return _with_cameras(lambda c: replace(c, body_from_cam=about_left @ c.body_from_cam), None, rig)
 
     return RigFault(f"camera-imu {axis}", degrees, "deg", change)
 
 
 def delay(milliseconds: float) -> RigFault:
     """A wrong delay of the IMU's stamps against the cameras'."""
-
-    def change(rig: RigCalibration) -> RigCalibration:
-        return _with_cameras(rig, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
-
-    return RigFault("delay", milliseconds, "ms", change)
+    late = partial(_with_cameras, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
+    return RigFault("delay", milliseconds, "ms", late)
 
 
 def another_robots_file(rig: RigCalibration) -> RigFault:
@@ -117,9 +107,9 @@ def unlike_robot(rig: RigCalibration, seed: int) -> RigCalibration:
         own = se3(so3_exp(np.radians(0.4) * rng.standard_normal(3)), np.zeros(3))
         return replace(camera, intrinsics_px=lens, body_from_cam=camera.body_from_cam @ own)
 
-    other = baseline(float(rng.standard_normal())).change(_with_cameras(rig, built, None))
+    other = baseline(float(rng.standard_normal())).change(_with_cameras(built, None, rig))
     turned = se3(so3_exp(np.radians(1.0) * rng.standard_normal(3)), np.zeros(3))
-    return _with_cameras(other, lambda c: replace(c, body_from_cam=turned @ c.body_from_cam), None)
+    return _with_cameras(lambda c: replace(c, body_from_cam=turned @ c.body_from_cam), None, other)
 
 
 def standard_faults() -> list[RigFault]:
@@ -137,11 +127,7 @@ def standard_faults() -> list[RigFault]:
 
 def swapped(good: Recording) -> Recording:
     """Left images in the place of right ones."""
-
-    def exchanged(frame: StoredFrame) -> StoredFrame:
-        return replace(frame, left=frame.right, right=frame.left)
-
-    return with_frames(good, np.arange(len(good)), exchanged)
+    return with_frames(good, np.arange(len(good)), lambda frame: replace(frame, left=frame.right, right=frame.left))
 
 
 def mirrored(good: Recording) -> Recording:
@@ -150,10 +136,8 @@ def mirrored(good: Recording) -> Recording:
     def flipped(image: StoredImage) -> StoredImage:
         return png_image(np.ascontiguousarray(cv2.flip(decode_grey(image), 1)))
 
-    def changed(frame: StoredFrame) -> StoredFrame:
-        return replace(frame, left=flipped(frame.left), right=flipped(frame.right))
-
-    return with_frames(good, np.arange(len(good)), changed)
+    every = np.arange(len(good))
+    return with_frames(good, every, lambda frame: replace(frame, left=flipped(frame.left), right=flipped(frame.right)))
 
 
 def _rotation(axis: tuple[float, float, float], degrees: float) -> Array:
@@ -161,7 +145,7 @@ def _rotation(axis: tuple[float, float, float], degrees: float) -> Array:
 
 
 def _with_cameras(
-    rig: RigCalibration, change: Callable[[CameraCalibration], CameraCalibration], chosen: set[int] | None
+    change: Callable[[CameraCalibration], CameraCalibration], chosen: set[int] | None, rig: RigCalibration
 ) -> RigCalibration:
     cameras = [change(c) if chosen is None or n in chosen else c for n, c in enumerate(rig.cameras)]
     return replace(rig, cameras=tuple(cameras))

@@ -90,10 +90,7 @@ def with_imu(recording: Recording, imu: ImuSamples) -> Recording:
 def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Callable[[Recording], Recording]:
     """Samples multiplied by matrices (3, 3) or numbers."""
     by_accel, by_gyro = (np.eye(3) * by if np.ndim(by) < 2 else by for by in (accel, gyro))
-
-    def multiplied(of: ImuSamples) -> ImuSamples:
-        return ImuSamples(of.stamps_ns, of.gyro_radps @ by_gyro.T, of.accel_mps2 @ by_accel.T)
-
+    multiplied = lambda of: ImuSamples(of.stamps_ns, of.gyro_radps @ by_gyro.T, of.accel_mps2 @ by_accel.T)  # noqa: E731
     return lambda recording: replace(recording, imu=multiplied(recording.imu))
 
 

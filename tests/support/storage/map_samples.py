@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import Array, se3_exp
+from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import CameraEntry, RecordingEntry
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.mapformat.tile import Tile
@@ -17,6 +18,7 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from mapserver import releases
+from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import DraftContent, DraftDetails, MapStore
 from mapserver.store.survey_pictures import PICTURES_KEY, PictureIndex, PicturesReport, SurveyPicture
 from mapserver.survey.survey_map import History, SurveyMap
@@ -165,6 +167,13 @@ def save_picture_draft(
     blobs = [index, *jpegs, *(store.blob(one.sha256) for one in before)]
     said = PicturesReport(sha256=sha256_hex(index), bytes=sum(map(len, blobs)), pictures=len(taken) + len(before))
     return save_tile(store, site, {PICTURES_KEY: msgspec.to_builtins(said)}, [("surfel", data) for data in blobs])
+
+
+def align(store: MapStore, site: str, x_m: float = 0.0) -> None:
+    """A map's origin lies so far along the building's x axis."""
+    frame = BuildingFrame(x_m=x_m, y_m=0.0, yaw_rad=0.0)
+    aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
+    store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
 
 
 def publish_samples(store: MapStore, count: int, *, first: int = 0, site: str = "lab") -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
+from fleetmap.mapformat.building import Building, FloorEntry
 from fleetmap.mapformat.tile import Tile
 from mapserver.fleet.building import keep_building
-from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore
+from support.storage.map_samples import align
 from support.worlds import robot_world
 
 SITES = ("low", "high")
@@ -28,9 +28,7 @@ def house(
     store = MapStore.open(folder, create=True)
     for site, tiles, at_m in (("low", low, 0.0), ("high", high, x_m)):
         robot_world.save(store, site=site, of=tiles, has_grid=has_grid)
-        frame = BuildingFrame(x_m=at_m, y_m=0.0, yaw_rad=0.0)
-        aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
-        store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
+        align(store, site, at_m)
     floors = tuple(FloorEntry(site=site, level=f"L{n}", height_m=4.0 * n) for n, site in enumerate(SITES))
     keep_building(store, Building(name="tower", floors=floors), NOBODY)
     return store

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyrage
 import pytest
 
-from fleetmap.messages import FailureReport, encode_message
+from fleetmap.messages import encode_message
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox, QueuedReport
@@ -24,6 +24,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.trust import init_here, update_lists
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.reports import blindness
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
 
@@ -72,10 +73,7 @@ class Robot:
     def fail(self, clock: Clock) -> None:
         failure = f"{self.name}-{len(self.failed)}"
         self.failed.add(failure)
-        report = FailureReport(
-            site=SITE, robot=self.name, id=failure, stamp_ns=1, wall_ns=clock.now_ns, duration_s=2.0, kind="blind", status="LOST",
-            cause="dark", version=1,
-        )  # fmt: skip
+        report = blindness(failure, self.name, wall_ns=clock.now_ns)
         self.outbox.put(QueuedReport(failure, encode_message(report)))
 
     @property
