@@ -28,7 +28,7 @@ expect.set_options(timeout=30_000)  # a busy machine answers late
 
 
 @pytest.fixture(autouse=True)
-def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def free_bytes(monkeypatch) -> list[int]:
     """What is free on every disk that this process asks for: a terabyte, unless a test says otherwise."""
     statvfs, free = os.statvfs, [1 << 40]
 
@@ -42,7 +42,7 @@ def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture(autouse=True)
-def quick_passwords(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick_passwords(monkeypatch) -> None:
     use_quick_passwords(monkeypatch)
 
 
@@ -59,7 +59,7 @@ def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
 
 
 @pytest.fixture(scope="session")
-def room_ride(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room_ride(tmp_path_factory) -> Path:
     """A recording of six seconds along a wall of the room, and back."""
     return write_mcap(tmp_path_factory.mktemp("recordings") / "ride", there_and_back())
 
@@ -72,7 +72,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 @pytest.fixture(scope="session")
-def s3_bucket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def s3_bucket(tmp_path_factory) -> Iterator[str]:
     """The URL of a bucket in an S3 server, whose address and credentials are in the environment."""
     with s3_server(tmp_path_factory.mktemp("s3")) as address, pytest.MonkeyPatch.context() as patch:
         for name, value in (KEYS | {"AWS_ENDPOINT_URL": address}).items():
@@ -93,7 +93,7 @@ def postgres() -> Iterator[PostgresServer]:
 
 
 @pytest.fixture(params=["folder", *(("s3", "postgres") if HAS_REMOTE else ())])
-def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def store_folder(request, tmp_path: Path) -> Path:
     """The folder of a new store, whose content is there or in S3, and its metadata there or in PostgreSQL."""
     folder = tmp_path / "store"
     if request.param != "folder":
@@ -105,7 +105,7 @@ def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(params=["sqlite", *(("postgres",) if HAS_REMOTE else ())])
-def metadata_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def metadata_folder(request, tmp_path: Path) -> Path:
     """The folder of a new store, whose metadata is there or in PostgreSQL."""
     if request.param == "postgres":
         write_places(tmp_path, Places(database=request.getfixturevalue("postgres").database()))
@@ -120,7 +120,7 @@ def browser() -> Iterator[Chromium]:
 
 
 @pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with serving(folder) as server:
@@ -142,7 +142,7 @@ def page(browser: Chromium) -> Iterator[Page]:
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]):
+def run(capsys):
     """The command line in this process."""
 
     def run(*arguments: object, status: int = 0) -> str:

@@ -129,7 +129,7 @@ def test_damaged_and_missing_bytes_are_server_errors(server: Server) -> None:
     check_problem(server.client.get(f"/v1/tiles/{server.tile}"), 503, "cannot be read")
 
 
-def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch) -> None:
     monkeypatch.setattr(server.store, "sites", Mock(side_effect=ZeroDivisionError("secret")))
     response = server.client.get("/v1/sites")
     check_problem(response, 500, "internal error")
@@ -155,7 +155,7 @@ def test_service_endpoints(server: Server) -> None:
     check_problem(server.client.get("/readyz"), 503, "bus")
 
 
-def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_server_says_how_it_is(server: Server, monkeypatch) -> None:
     init_here(server.store)
     RobotRegister(server.store).authorities.init(["localhost"], None, None)
     jpeg = b"\xff\xd8" + bytes(3000) + b"\xff\xd9"
@@ -183,7 +183,7 @@ def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPat
     assert again["store"] == used, "files are counted now and then"
 
 
-def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch) -> None:
     refuse = Mock(side_effect=StoreError("no space left on device"))
     server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=1, version=1, status="LOST"))
     with monkeypatch.context() as full:
@@ -202,7 +202,7 @@ def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: 
         check_problem(server.client.get("/readyz"), 503, "cannot be stored")
 
 
-def test_a_page_of_robots_has_a_bounded_size(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_of_robots_has_a_bounded_size(server: Server, monkeypatch) -> None:
     metrics = {f"m{n}": "x" * 2000 for n in range(25)}
     for number in range(120):
         name = f"r{number:03d}"

@@ -78,9 +78,7 @@ def test_a_page_from_elsewhere_changes_nothing(server: Server) -> None:
 
 
 @pytest.mark.parametrize("asked", ["are_there", "session"])
-def test_a_store_that_does_not_answer_lets_nobody_in(
-    server: Server, monkeypatch: pytest.MonkeyPatch, asked: str
-) -> None:
+def test_a_store_that_does_not_answer_lets_nobody_in(server: Server, monkeypatch, asked: str) -> None:
     away = Mock(side_effect=StoreError("postgresql://db.example/site_a cannot be read"))
     vic = named(server)["vic"] if asked == "session" else {}
     monkeypatch.setattr(type(server.store.operators), asked, away)
@@ -171,7 +169,7 @@ def test_each_role_may_what_it_may(server: Server, name: str, reads: int, sees_m
         assert [event for event in server.store.events("lab") if event.actor == "bob"] == []
 
 
-def test_an_open_page_keeps_no_session_from_ending(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_open_page_keeps_no_session_from_ending(server: Server, monkeypatch) -> None:
     headers, now_s = named(server)["vic"], time.time()
     monkeypatch.setattr(server.store, "now_ns", lambda: int(now_s * 1e9))
     with client_of(server) as client:
@@ -225,7 +223,7 @@ def test_the_cookie_is_for_this_host_and_tls_where_there_is_some() -> None:
 
 
 def test_a_slow_or_large_sign_in_is_refused_and_one_that_leaves_is_no_error(
-    server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    server: Server, monkeypatch, caplog
 ) -> None:
     monkeypatch.setattr(request_limits, "SIGN_IN_S", 0.1)
     monkeypatch.setattr(request_limits, "LINGER_S", 0.1)

@@ -96,9 +96,7 @@ def test_uploads_are_few_at_once(server: Server, lab: Path) -> None:
     assert files(lab) == [f"{number}.mcap" for number in range(4)]
 
 
-def test_an_upload_that_hardly_goes_on_loses_its_place(
-    server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_upload_that_hardly_goes_on_loses_its_place(server: Server, lab: Path, monkeypatch) -> None:
     monkeypatch.setattr(request_limits, "BODY_S", 0.5)
     monkeypatch.setattr(request_limits, "LINGER_S", 0.1)
     dripping = [0.05, MIDDLE | {"body": b"x"}] * 200
@@ -140,7 +138,7 @@ def test_half_an_upload_leaves_nothing(server: Server, lab: Path) -> None:
     assert files(lab) == [".friday.mcap.part"], "what a killed server left is removed, other programs' files are not"
 
 
-def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch, free_bytes: list[int]) -> None:
+def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch, free_bytes: list[int]) -> None:
     write = os.write
 
     def filled(descriptor: int, data: bytes) -> int:
@@ -202,9 +200,7 @@ def test_a_long_name_is_found_again(server: Server, lab: Path) -> None:
     assert server.client.get(INBOX).json()["done"] == 1
 
 
-def test_a_build_without_space_is_an_answer_and_in_no_log(
-    server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_build_without_space_is_an_answer_and_in_no_log(server: Server, lab: Path, monkeypatch) -> None:
     lab.mkdir()
 
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -213,7 +209,7 @@ def test_a_build_without_space_is_an_answer_and_in_no_log(
     assert server.store.log(site="lab", limit=1)[0].kind == "saved"
 
 
-def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monkeypatch) -> None:
     lab.mkdir()
     known: list[str] = []
 
@@ -226,7 +222,7 @@ def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monke
     assert known == ["build_started"]
 
 
-def test_a_build_without_its_plugin_names_it(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_without_its_plugin_names_it(server: Server, lab: Path, monkeypatch) -> None:
     lab.mkdir()
     monkeypatch.setattr(night_runs, "plugins", lambda _: {})
     check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 409, "entry point nightly")

@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from fleetmap.errors import InvalidValueError
 from fleetmap.messages import RobotHealth
@@ -124,7 +123,7 @@ def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
             assert isinstance(refused.exception, InvalidValueError)
 
 
-def test_an_acknowledged_alert_is_silent_until_it_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_acknowledged_alert_is_silent_until_it_begins_anew(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("mapserver.serving.background_tasks.HEARD_WITHIN_S", 0.0)
     (tmp_path / "token").write_text("secret\n")
     expected: list[str] = []

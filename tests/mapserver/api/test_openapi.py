@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import pytest
-
 from support.fleet.asked_api import answers
 from support.storage.map_samples import save_grid_draft
 
 
-def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("mapserver.api.app.plugins", lambda _: {})  # a plug-in's tests ask its own
     asked = answers(tmp_path, monkeypatch, lambda store: save_grid_draft(store, site="hall"))
     assert sum(len(statuses) for statuses in asked.values()) >= 100

@@ -171,7 +171,7 @@ def test_one_of_two_tokens_is_revoked(server: Server, named: dict[str, dict[str,
 
 
 def test_secrets_are_in_one_answer_alone(
-    server: Server, named: dict[str, dict[str, str]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    server: Server, named: dict[str, dict[str, str]], tmp_path: Path, caplog
 ) -> None:
     client, ada = server.client, named["ada"]
     caplog.set_level("DEBUG")

@@ -46,7 +46,7 @@ sys.argv = ["{package}", "--help"]
     assert shown.splitlines()[-1] == "[]"
 
 
-def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exit_statuses(tmp_path: Path, capsys) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)
         maps.save("empty", DraftContent(tiles=[], vocabulary=b"w", details=draft_details()))
@@ -70,7 +70,7 @@ def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert status("mapserver", "publish", "--site", "lab", *to_store) == 0
 
 
-def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_publishing_says_which_way_nobody_drove(capsys, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
@@ -82,7 +82,7 @@ def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[st
     assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
 
 
-def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_interruption_is_130(monkeypatch, capsys) -> None:
     interrupted = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(cli, "app", interrupted)
     assert status("mapserver", "build") == 130
@@ -114,7 +114,7 @@ def _keys(section: Section) -> dict[str, object]:
     return {field.encode_name: getattr(section, field.name) for field in msgspec.structs.fields(section)}
 
 
-def test_the_file_gives_defaults_and_the_command_line_wins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_file_gives_defaults_and_the_command_line_wins(tmp_path: Path, capsys) -> None:
     """Site and store are said once for all commands; a section of a command comes before them."""
     with MapStore.open(tmp_path / "store", create=True) as maps:
         for site in ("lab", "hall", "hall"):
@@ -129,9 +129,7 @@ def test_the_file_gives_defaults_and_the_command_line_wins(tmp_path: Path, capsy
     assert "site hall version 2" in capsys.readouterr().out
 
 
-def test_build_takes_its_settings_from_the_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_build_takes_its_settings_from_the_file(monkeypatch, tmp_path: Path, capsys) -> None:
     build = Mock(return_value=(Draft(1, "done", {}, {}), None))
     monkeypatch.setattr("mapserver.library.build_draft", build)
     opened = nullcontext(SimpleNamespace(sensor_set=SensorSet.STEREO))
@@ -166,9 +164,7 @@ def test_build_takes_its_settings_from_the_file(
         ("[build]\nthreads = -1", "build.threads = -1"),
     ],
 )
-def test_a_wrong_file_is_a_usage_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
-) -> None:
+def test_a_wrong_file_is_a_usage_error(tmp_path: Path, capsys, text: str, said: str) -> None:
     file = tmp_path / "site.toml"
     file.write_text(text)
     with pytest.raises(UsageError, match=said):

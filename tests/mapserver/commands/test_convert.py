@@ -50,9 +50,7 @@ def test_refuses_to_overwrite_unless_forced(euroc: Path, tmp_path: Path) -> None
     assert "itself" in str(run(out, out, "--force").exception)
 
 
-def test_a_failure_leaves_nothing_and_harms_nothing(
-    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_leaves_nothing_and_harms_nothing(euroc: Path, tmp_path: Path, monkeypatch) -> None:
     """The disk is full in the middle: the old output stays, no half file appears."""
     written = []
 

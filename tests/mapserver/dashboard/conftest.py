@@ -9,7 +9,7 @@ from support.pages.browser import Chromium
 
 
 @pytest.fixture(scope="module")
-def small_fleet(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def small_fleet(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     """A server with eight robots, which the keyboard gets through."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)

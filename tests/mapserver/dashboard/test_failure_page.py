@@ -125,7 +125,7 @@ def report(name: str, **changes: object) -> FailureReport:
 
 
 @pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)

@@ -22,7 +22,7 @@ MOST_CLICKS = 2
 
 
 @pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_shift(folder)
     with serving(folder) as server, MapStore.open(folder) as store:

@@ -40,7 +40,7 @@ def make_certificate(folder: Path, number: int) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     """A server beyond loopback, with TLS and four operators."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)

@@ -64,7 +64,7 @@ def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     ids=["near enough", "in doubt", "something else wrong"],
 )
 def test_frames_are_followed_again_only_where_that_may_change_a_verdict(
-    off: dict[str, float], is_enough: bool, monkeypatch: pytest.MonkeyPatch
+    off: dict[str, float], is_enough: bool, monkeypatch
 ) -> None:
     """A principal point that moved by 3.5 px is none that a robot would notice, and the recording is used as it is."""
     turned = {"camera_imu_y": off["principal_x"] / Rectifier(calibration()).camera.focal_px}  # which looks the same

@@ -29,7 +29,7 @@ Change = Callable[[Recording], Recording]
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def ride(tmp_path_factory) -> Recording:
     """Four seconds along a wall and back, on wheels, with an IMU."""
     path = tmp_path_factory.mktemp("ride") / "ride.mcap"
     write_ride(path, standing_first(4.0, 2.4), 4.0, SensorSet.STEREO_INERTIAL)
@@ -37,7 +37,7 @@ def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture
-def _quick(monkeypatch: pytest.MonkeyPatch, seen: dict[object, object]) -> None:
+def _quick(monkeypatch, seen: dict[object, object]) -> None:
     """Without the odometry and the adjustment of the calibration, and with what was seen in the same images before."""
     monkeypatch.setattr(run_checks, "_by_odometry", lambda *_: (None, None))
     monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))
@@ -151,7 +151,7 @@ ROTATED = "images of both cameras are rotated by 180 degrees: switch the driver'
 def test_a_ros_1_bag_with_a_fault_is_named_alike(
     ride: Recording,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch,
     kind: str,
     change: Callable[[Any], None],
     name: str,
@@ -185,9 +185,7 @@ def test_a_ros_1_bag_with_a_fault_is_named_alike(
         (0.001, False, "a median depth of 0.002817 m"),
     ],
 )
-def test_depths_in_another_unit(
-    tmp_path_factory: pytest.TempPathFactory, factor: float, has_wheels: bool, says: str
-) -> None:
+def test_depths_in_another_unit(tmp_path_factory, factor: float, has_wheels: bool, says: str) -> None:
     """Whose fault it is nothing tells where wheels and depths alone know metres: no wheels are left out for it."""
     path = tmp_path_factory.mktemp("rgbd") / "ride.mcap"
     write_ride(path, standing_first(4.0, 2.4), 4.0, SensorSet.RGBD)

@@ -37,7 +37,7 @@ SAMPLE = make_sample(26)
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def good(tmp_path_factory) -> Recording:
     return open_recording(write_mcap(tmp_path_factory.mktemp("doctor") / "r", SAMPLE))
 
 

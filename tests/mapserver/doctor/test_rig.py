@@ -96,7 +96,7 @@ def ride() -> tuple[RigCalibration, list[CameraFrame]]:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory) -> Path:
     return write_rig(tmp_path_factory.mktemp("rig") / "ride.mcap", *ride())
 
 

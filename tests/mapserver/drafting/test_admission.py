@@ -25,7 +25,7 @@ Checked = Callable[..., admission.CheckedRecording]
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def recording(tmp_path_factory) -> Recording:
     return open_recording(write_mcap(tmp_path_factory.mktemp("admission") / "r", make_sample(3)))
 
 
@@ -36,7 +36,7 @@ def measured(parameter: P, value: float) -> MeasuredCalibration:
 
 
 @pytest.fixture
-def checked(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> Checked:
+def checked(recording: Recording, monkeypatch) -> Checked:
     """The recording, checked by a doctor who measures `first`, and `again` after a correction."""
 
     def check(
@@ -116,9 +116,7 @@ def test_a_correction_that_the_second_look_denies_is_for_a_person(checked: Check
     assert "after its correction" in found.calibration.doubted["pair geometry"]
 
 
-def test_a_wrong_recording_is_refused_before_its_drive_is_followed(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_recording_is_refused_before_its_drive_is_followed(recording: Recording, monkeypatch) -> None:
     swapped = Finding("left and right", Verdict.FAIL, None, "", "the cameras are swapped")
     monkeypatch.setattr(sensors, "stamp_order", lambda _: swapped)
     checks = sys.modules[admission.run_checks.__module__]

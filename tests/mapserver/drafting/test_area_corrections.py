@@ -74,9 +74,7 @@ def test_points_are_inside_as_the_even_odd_rule_says_however_many_there_are() ->
 
 
 @pytest.mark.parametrize("drives", ["there", "elsewhere", "there before"])
-def test_an_area_is_forgotten_once_a_later_recording_covers_it(
-    survey: SurveyMap, drives: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_area_is_forgotten_once_a_later_recording_covers_it(survey: SurveyMap, drives: str, monkeypatch) -> None:
     """The recording is joined to a map without it, and once more to the whole map if it does not show what is there now."""
     due = area(FORGET, (-1e3, -1e3), (1e3, 1e3))
     glass = area(NEVER_USE, tuple(survey.points_map[5, :2] - 0.01), tuple(survey.points_map[5, :2] + 0.01))

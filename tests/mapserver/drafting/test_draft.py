@@ -33,7 +33,7 @@ NOT_FOR_ROBOTS = {"map_bytes", "culled", "sessions", "directions", "starts", "vi
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(tmp_path_factory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", SAMPLE)
 
 
@@ -53,7 +53,7 @@ def read_tum(path: Path) -> Array:
 
 
 @pytest.fixture(scope="module")
-def done(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(drive: Path, tmp_path_factory) -> Path:
     """A folder with everything that one build in the truth's frame leaves."""
     out = tmp_path_factory.mktemp("out")
     files = ["--report", out / "r.json", "--trajectory-out", out / "t.tum", "--picture", out / "p.png"]
@@ -170,7 +170,7 @@ def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:
     assert "no ground truth" in str(error)
 
 
-def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path, monkeypatch) -> None:
     to_store = ["--site", "lab", "--store", tmp_path / "store"]
     for arguments, kind, said in (
         ([drive, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),

@@ -76,7 +76,7 @@ def test_a_job_tells_how_far_it_is_until_it_ends(store: MapStore) -> None:
     JobProgress(store, None)("odometry", 1, 2)  # a build that no job stands for
 
 
-def test_a_job_keeps_its_log(store: MapStore, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_job_keeps_its_log(store: MapStore, capfd) -> None:
     """What it printed, and why it ended; of the last jobs alone."""
     (store.folder / "job-1.log").touch()
     with recorded_job(store, "new", "build") as job:
@@ -103,7 +103,7 @@ def test_a_full_disk_under_the_output_does_not_stop_a_build(tmp_path: Path) -> N
         full.close()
 
 
-def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch) -> None:
     with MapStore.open(tmp_path, create=True) as maps, recorded_job(maps, "new", "build") as job:
         monkeypatch.setattr(maps, "tell_progress", Mock(side_effect=StoreError("the store is busy")))
         JobProgress(maps, job.number)("odometry", 1, 2)

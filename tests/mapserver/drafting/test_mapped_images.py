@@ -86,7 +86,7 @@ def test_what_was_read_leaves_memory(tmp_path: Path) -> None:
     assert 0 < held_kb < 128 * 1024
 
 
-def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_said(tmp_path: Path, monkeypatch) -> None:
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr(mapped_images.os, "posix_fallocate", full)
     with MappedImageStore(tmp_path) as shelf, pytest.raises(StoreError, match="free space"):

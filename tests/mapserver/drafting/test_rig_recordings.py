@@ -128,9 +128,7 @@ def test_all_views_of_a_frame_either_judge_a_draft_or_choose_its_landmarks(recor
     assert {0, 19} <= {number for number, _ in asked}
 
 
-def test_further_views_are_examined_beside_the_corrected_first_one(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_further_views_are_examined_beside_the_corrected_first_one(recorded: Path, tmp_path: Path, monkeypatch) -> None:
     """A plate of cameras that is turned as a whole agrees with itself, and no longer once its first view is corrected."""
     turn, further = se3_exp(np.array([0, 0, 0.02, 0, 0, 0])), Mock(return_value=[])
 

@@ -42,14 +42,12 @@ from support.worlds.pinhole_pair import CAMERA
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(tmp_path_factory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
 
 
 @pytest.mark.parametrize(("has_room", "decodings"), [(True, 8), (False, 12)])
-def test_frames_are_decoded_once(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_room: bool, decodings: int
-) -> None:
+def test_frames_are_decoded_once(drive: Path, tmp_path: Path, monkeypatch, has_room: bool, decodings: int) -> None:
     found: list[int] = []
     decode = series.decode_frame
     monkeypatch.setattr(series, "decode_frame", lambda stored: (found.append(stored.stamp_ns), decode(stored))[1])
@@ -73,7 +71,7 @@ def test_frames_are_decoded_once(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_recording_closes_the_one_before(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_recording_closes_the_one_before(drive: Path, tmp_path: Path, monkeypatch) -> None:
     other = write_mcap(tmp_path / "other", make_sample(4))
     closed: list[int] = []
     close = Recording.close
@@ -86,9 +84,7 @@ def test_another_recording_closes_the_one_before(drive: Path, tmp_path: Path, mo
     assert closed == [8, 4, 8]
 
 
-def test_a_recording_that_cannot_be_used_is_closed(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_that_cannot_be_used_is_closed(drive: Path, tmp_path: Path, monkeypatch) -> None:
     closed: list[int] = []
     monkeypatch.setattr(Recording, "close", lambda self: closed.append(len(self)))
     with (
@@ -105,7 +101,7 @@ def unwatched(_: object) -> None:
 
 
 def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drive: Path, tmp_path: Path, monkeypatch
 ) -> None:
     """And from nothing else: a calibration that was tried on the way, or given before a correction, is not the survey's.
 
@@ -150,9 +146,7 @@ def test_a_recording_ends_where_its_robot_is_lifted(
     assert [(part.start, part.stop) for part in parts_between_lifts(estimates)] == parts
 
 
-def test_nobody_holds_what_was_begun_once_its_loops_are_closed(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, tmp_path: Path, monkeypatch) -> None:
     """Its landmarks are as large as those that are made anew then."""
 
     @dataclass
@@ -198,7 +192,7 @@ def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
         assert words in surveyed.evidence().doubted["pair geometry"]
 
 
-def test_what_cannot_judge_its_pair_takes_the_turn_by_an_earlier_survey(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_judge_its_pair_takes_the_turn_by_an_earlier_survey(monkeypatch) -> None:
     """The earlier one is kept by what judged its pair alone, the surest counts, and one that may be chance changes nothing."""
     nothing: Any = None
     marks = replace(Landmarks.empty(), obs_pixels=np.zeros((1, 3)), obs_camera=np.zeros(1, np.int64))

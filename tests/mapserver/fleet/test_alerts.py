@@ -127,7 +127,7 @@ def test_metrics_name_the_robots_that_are_lost_for_longest(store: MapStore, cloc
     assert "r1" not in named()
 
 
-def test_a_disk_that_fills_is_told(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_is_told(store: MapStore, clock: Clock, monkeypatch) -> None:
     for total_gb, free_gb, is_told in ((500, 60, False), (500, 49, True), (20_000, 60, False), (20_000, 49, True)):
         space = DiskSpace(total_gb * 10**9, free_gb * 10**9)
         monkeypatch.setattr(store, "disk_space", lambda space=space: space)

@@ -73,7 +73,7 @@ def test_it_reaches_no_network() -> None:
     assert ended.args[0] != sys.executable
 
 
-def test_a_system_without_namespaces_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_without_namespaces_says_so(monkeypatch) -> None:
     monkeypatch.setattr(bounded_process.shutil, "which", lambda _: "/bin/false")
     assert without_network() == []
     assert run("pass").args[0] == sys.executable

@@ -54,9 +54,7 @@ def send(fleet: Fleet, clock: Clock, number: int, robot: str = "r1", jpeg: bytes
     return True
 
 
-def test_failures_of_a_robot_come_at_a_rate(
-    fleet: Fleet, store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failures_of_a_robot_come_at_a_rate(fleet: Fleet, store: MapStore, clock: Clock, monkeypatch) -> None:
     assert [send(fleet, clock, number) for number in range(100)] == [True] * 60 + [False] * 40
     assert send(fleet, clock, 0, "r2"), "another robot is not in its way"
     clock.now_ns += 180 * SECOND_NS
@@ -81,7 +79,7 @@ def test_rates_forget_nobody_who_floods(clock: Clock) -> None:
     assert not limit.admits("a")
 
 
-def test_a_full_table_of_rates_is_not_searched_at_every_message(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_table_of_rates_is_not_searched_at_every_message(clock: Clock, monkeypatch) -> None:
     """Invented names would else cost milliseconds each, and everybody waits for them."""
     limit = RateLimit(2, 1.0, clock)
     monkeypatch.setattr(limit, "_forget", search := Mock(side_effect=limit._forget))
@@ -108,7 +106,7 @@ def test_names_that_went_leave_nothing_behind(store: MapStore, fleet: Fleet, clo
         service.close()
 
 
-def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog) -> None:
     """Of 64 kB in the place of a site: no rate is kept for it, and the log shows its beginning."""
     with MemoryBus(MemoryHub()) as bus:
         service = BusService(store, fleet, bus, lambda *_: None)
@@ -121,7 +119,7 @@ def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytes
         service.close()
 
 
-def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monkeypatch) -> None:
     large = msgspec.msgpack.encode({**msgspec.to_builtins(failure(clock, 1)), "more": "x" * MAX_FAILURE_BYTES})
     assert "the limit is" in fleet.take_failure_bytes("lab", "r1", large).refused
     (kept,) = (store.folder / "refused").glob("*.msgpack")
@@ -167,7 +165,7 @@ def test_pictures_have_a_bound_at_once(store: MapStore, clock: Clock) -> None:
     assert kept_bytes() <= 100_000
 
 
-def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock, monkeypatch) -> None:
     monkeypatch.setattr(IngestSettings, "retention", lambda _: FleetRetention(failures_per_robot=20))
     fleet = Fleet(store, clock_ns=clock)
     send(fleet, clock, 0, "calm")

@@ -23,7 +23,7 @@ from support.storage.map_samples import publish_samples, save_sample_draft
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Known]:
+def folder(tmp_path_factory) -> tuple[Path, Known]:
     """A store with what three robots said."""
     folder, known = tmp_path_factory.mktemp("site"), Known()
     clock = {"ns": time.time_ns() - 300 * NS}

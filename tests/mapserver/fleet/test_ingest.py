@@ -76,7 +76,7 @@ def test_a_clock_that_is_set_back_freezes_no_robot(site: Site) -> None:
 
 @pytest.mark.parametrize("metadata_folder", ["sqlite"], indirect=True)  # nothing of it is kept
 @pytest.mark.parametrize("ahead_s", [0.0, 0.02, 0.5, 0.97, -3600.0, 0.3 * 86400])
-def test_two_robots_of_one_name_are_told(site: Site, caplog: pytest.LogCaptureFixture, ahead_s: float) -> None:
+def test_two_robots_of_one_name_are_told(site: Site, caplog, ahead_s: float) -> None:
     """Whatever the other one's clock says; one alone is not, with a late network, restarts and a clock that is set."""
 
     def hear(at_s: float, wall_s: float) -> bool:
@@ -174,9 +174,7 @@ def test_what_comes_again_is_counted_once(site: Site) -> None:
 
 
 @pytest.mark.parametrize("fault", [StoreError("full"), UnknownOutcomeError("lost at the end of a change")])
-def test_counts_come_again_unless_the_store_may_have_them(
-    site: Site, monkeypatch: pytest.MonkeyPatch, fault: StoreError
-) -> None:
+def test_counts_come_again_unless_the_store_may_have_them(site: Site, monkeypatch, fault: StoreError) -> None:
     site.run(made(site, 2), 120)
     before = site.store.fleet.counters("lab", "robot")
     add = type(site.store.fleet).add

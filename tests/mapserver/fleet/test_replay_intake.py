@@ -107,7 +107,7 @@ def test_what_no_robot_writes_is_refused_and_nothing_else_is_lost(
 
 @pytest.mark.parametrize("opcode", [0, Opcode.MESSAGE])
 def test_a_small_file_of_many_records_costs_little_and_nobody_waits_for_it(
-    server: Server, tmp_path: Path, opcode: int, monkeypatch: pytest.MonkeyPatch
+    server: Server, tmp_path: Path, opcode: int, monkeypatch
 ) -> None:
     """507 bytes of 7 million empty records took 6 s, on the thread that hears all robots."""
     records = (bytes([opcode]) + bytes(8)) * (60_000_000 // 9)
@@ -139,7 +139,7 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
     assert "limit" in server.fleet.replays.take("lab", "r1", part).refused
 
 
-def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uploads_and_rates_are_bounded(server: Server, monkeypatch) -> None:
     ended = subprocess.CompletedProcess([], 1, "", "no recording")
     monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: ended)
     for number in range(replay_intake.MAX_UPLOADS + 1):

@@ -47,7 +47,7 @@ def test_tiles_of_a_polygon(corners: list[tuple[float, float]], tiles: list[tupl
     assert SurveyRequest("0", 0, "", "", [list(corner) for corner in corners]).tiles(16.0) == tiles
 
 
-def test_a_request_is_read_once(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_is_read_once(store: MapStore, monkeypatch) -> None:
     """Every robot asks for all of them again and again, and they may be in an object store."""
     made = [ask_for_survey(store, SITE, AISLE, ADA) for _ in range(2)]
     assert store.survey_requests(SITE) == made
@@ -137,7 +137,7 @@ def test_what_is_no_polygon_is_refused(store: MapStore, corners: list[tuple[floa
     assert store.survey_requests(SITE) == []
 
 
-def test_limits(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits(store: MapStore, monkeypatch) -> None:
     monkeypatch.setattr(requests, "MOST_REQUESTS", 1)
     ask_for_survey(store, SITE, AISLE, ADA)
     with pytest.raises(StateError, match="open requests"):

@@ -88,9 +88,7 @@ def test_a_night_that_reads_its_recordings_keeps_them(run, inbox: Path, tmp_path
     assert "recordings of surveys: 5 removed" in run(*command)
 
 
-def test_a_recording_that_somebody_else_removes_meanwhile_ends_nothing(
-    inbox: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_that_somebody_else_removes_meanwhile_ends_nothing(inbox: Path, monkeypatch) -> None:
     removed = shutil.rmtree
 
     def twice(path: Path) -> None:

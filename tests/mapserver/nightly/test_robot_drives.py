@@ -60,7 +60,7 @@ def scene(tmp_path: Path) -> Scene:
     return Scene(tmp_path)
 
 
-def test_a_drive_lands_whole_and_is_built(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_lands_whole_and_is_built(scene: Scene, monkeypatch) -> None:
     assert scene.send(until=4096) == [4096]
     scene.drives.build()
     (part,) = scene.arrived()
@@ -96,7 +96,7 @@ def test_a_closed_request_takes_no_more(scene: Scene) -> None:
     assert "not requested any more" in str(scene.send()[0])
 
 
-def test_a_lost_last_answer_sends_nothing_again(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_last_answer_sends_nothing_again(scene: Scene, monkeypatch) -> None:
     """Neither at the same server, nor at another one or a restarted one, nor once the night has moved the recording."""
     scene.send()
     last = ReplayPart(id="ab12ab12", total_bytes=len(DATA), offset=8192, data=DATA[8192:], survey=scene.request)
@@ -133,7 +133,7 @@ def test_a_robot_that_changes_to_another_server_begins_again(scene: Scene) -> No
 
 
 @pytest.mark.parametrize("fault", [errno.ENOSPC, errno.EIO])
-def test_what_the_disk_refuses_is_sent_again(scene: Scene, monkeypatch: pytest.MonkeyPatch, fault: int) -> None:
+def test_what_the_disk_refuses_is_sent_again(scene: Scene, monkeypatch, fault: int) -> None:
     write, calls = os.write, iter(range(100))
 
     def written(descriptor: int, data: bytes) -> int:
@@ -150,7 +150,7 @@ def test_what_the_disk_refuses_is_sent_again(scene: Scene, monkeypatch: pytest.M
     assert (scene.inbox / SITE / scene.arrived()[0]).read_bytes() == DATA
 
 
-def test_a_disk_that_gets_full_in_the_middle_loses_no_drive(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_gets_full_in_the_middle_loses_no_drive(scene: Scene, monkeypatch) -> None:
     scene.send(until=4096)
     with monkeypatch.context() as patch:
         patch.setattr(upload, "_KEPT_SHARE", 0.001)
@@ -160,7 +160,7 @@ def test_a_disk_that_gets_full_in_the_middle_loses_no_drive(scene: Scene, monkey
     assert scene.send()[-1] == len(DATA)
 
 
-def test_many_names_are_one_site_and_one_request(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_names_are_one_site_and_one_request(scene: Scene, monkeypatch) -> None:
     monkeypatch.setattr(robot_drives, "MOST_OF_A_REQUEST", 3)
     for number in range(3):
         assert scene.send(f"r{number}")[-1] == len(DATA)
@@ -175,7 +175,7 @@ def test_many_names_are_one_site_and_one_request(scene: Scene, monkeypatch: pyte
         scene.send("r3")
 
 
-def test_what_a_silent_robot_has_sent_does_not_stay(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_silent_robot_has_sent_does_not_stay(scene: Scene, monkeypatch) -> None:
     scene.send(until=4096)
     scene.drives.build()
     assert len(scene.arrived()) == 1

@@ -118,7 +118,7 @@ def test_guesses_are_few_and_say_nothing(operators: Operators, clock: Clock) -> 
     assert refused == {"Wrong name or password."}
 
 
-def test_without_the_bucket_a_guess_arrives(operators: Operators, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_bucket_a_guess_arrives(operators: Operators, monkeypatch) -> None:
     """The control of the test above."""
     monkeypatch.setattr(operators, "_tries", type("Open", (), {"admits": lambda *_: True})())
     guesses = [f"guess {n}" for n in range(TRIES + 3)] + [PASSWORD]
@@ -126,7 +126,7 @@ def test_without_the_bucket_a_guess_arrives(operators: Operators, monkeypatch: p
     assert [bool(operators.sign_in("ada", guess, "x").session) for guess in guesses][-1]
 
 
-def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch) -> None:
     """A hash of the same cost is verified for it."""
     verified: list[str] = []
     monkeypatch.setattr(module, "_dummy", DUMMY)

@@ -221,7 +221,7 @@ def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if
     assert "m into its recording" in said.report["warnings"][0]
 
 
-def test_a_second_choice_that_loses_more_views_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_choice_that_loses_more_views_is_not_taken(monkeypatch) -> None:
     views = asked_views([session()])
     chooser = TileChooser(sound()[0].map, BudgetSettings(), None, WORDS)
     fixes = chooser._fixes(chooser._tiles(()), views)
@@ -312,7 +312,7 @@ def test_a_site_that_is_in_the_map_twice_is_refused() -> None:
     assert lookalike_words(None) == ""
 
 
-def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_probes_are_extracted_as_the_survey_did(monkeypatch) -> None:
     monkeypatch.setitem(extraction.EXTRACTORS, "other", other := Mock(side_effect=detect_in_slices))
     rectifier = Rectifier(calibration())
     sample = ride_sample(two_walls, 2, FRAME_S)

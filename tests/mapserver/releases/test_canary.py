@@ -194,7 +194,7 @@ def store(store: MapStore) -> MapStore:
 
 
 @pytest.fixture
-def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
+def meanwhile(monkeypatch) -> Callable[[Callable[[], object]], None]:
     """Something that happens once between the judgement of a draft and its release."""
     real = releases._pass_gate
 

@@ -3,8 +3,6 @@
 import asyncio
 from unittest.mock import Mock
 
-import pytest
-
 from fleetmap.errors import StoreError
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks
 
@@ -21,7 +19,7 @@ def run_for(chores: list[BackgroundTask], seconds: float) -> None:
     asyncio.run(run())
 
 
-def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None:
+def test_one_that_fails_stops_no_other(caplog) -> None:
     acts = Mock(side_effect=StoreError("the disk is full")), Mock(side_effect=ZeroDivisionError), Mock()
     run_for([BackgroundTask(*task) for task in zip("abc", (0.01, 0.01, 60.0), acts, strict=True)], 1.0)
     assert acts[0].call_count >= 2 and acts[1].call_count >= 2

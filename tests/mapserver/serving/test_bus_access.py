@@ -63,9 +63,7 @@ def register(store: MapStore, clock: Clock) -> RobotRegister:
     return RobotRegister(store)
 
 
-def test_tls_needs_certificates_and_loopback_nothing(
-    tmp_path: Path, register: RobotRegister, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_tls_needs_certificates_and_loopback_nothing(tmp_path: Path, register: RobotRegister, caplog) -> None:
     store = register.store
     bus, guard = prepare_bus(store, "tcp/127.0.0.1:0", insecure=False)
     assert (bus.access, guard) == (None, None)
@@ -89,7 +87,7 @@ def test_tls_needs_certificates_and_loopback_nothing(
     ],
 )
 def test_a_certificate_that_nobody_would_believe_is_an_error_at_start(
-    register: RobotRegister, caplog: pytest.LogCaptureFixture, file: str, days: int, words: str
+    register: RobotRegister, caplog, file: str, days: int, words: str
 ) -> None:
     at = Authorities(register._keys, datetime.now(UTC) + timedelta(days=days))
     if file == "robots-ca.crt":  # the server's own was renewed meanwhile
@@ -127,7 +125,7 @@ def health(robot: str) -> bytes:
 
 
 @pytest.mark.parametrize("is_guarded", [True, False])
-def test_row_9_invented_robots(register: RobotRegister, monkeypatch: pytest.MonkeyPatch, is_guarded: bool) -> None:
+def test_row_9_invented_robots(register: RobotRegister, monkeypatch, is_guarded: bool) -> None:
     """The program refuses them too, where the bus let them through."""
     monkeypatch.setattr(fleet_module, "MAX_ROBOTS", 200)
     store, hub = register.store, MemoryHub()
@@ -148,7 +146,7 @@ def test_row_9_invented_robots(register: RobotRegister, monkeypatch: pytest.Monk
         service.close()
 
 
-def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCaptureFixture) -> None:
+def test_rules_follow_the_register(register: RobotRegister, caplog) -> None:
     hub = MemoryHub()
     with MemoryBus(hub) as bus:
         register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")

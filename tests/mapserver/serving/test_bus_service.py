@@ -53,9 +53,7 @@ def test_a_robot_fetches_everything_once(world: World) -> None:
     assert [what for what, result, _ in world.counts if result == "ok"] == ["wanted", "manifest", *["blob"] * 3]
 
 
-def test_a_robot_takes_the_grid_with_its_version_and_then_what_changed(
-    world: World, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_robot_takes_the_grid_with_its_version_and_then_what_changed(world: World, caplog) -> None:
     def ready(seed: int) -> WantedVersion:
         save_grid_draft(world.store, seed)
         releases.publish(world.store, "lab", actor=Actor("ada", "a test"), force=True)
@@ -252,7 +250,7 @@ def test_a_report_that_cannot_be_read_is_refused_for_good_and_set_aside(world: W
     assert world.store.verify().faults == []
 
 
-def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytest.LogCaptureFixture) -> None:
+def test_bad_messages_are_counted_and_change_nothing(world: World, caplog) -> None:
     bus = world.robot_bus
     bus.publish(robot_key("lab", "r1", "ack"), b"nonsense")
     stolen = RobotAck(site="lab", robot="r2", stamp_ns=1, version=1)
@@ -264,7 +262,7 @@ def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytes
     assert "in the name of 'r2'" in caplog.text
 
 
-def test_reports_have_a_size_and_a_rate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_have_a_size_and_a_rate(world: World, monkeypatch) -> None:
     def report(stamp_ns: int, words: dict[str, object]) -> bytes:
         fields = {"site": "lab", "robot": "r1", "stamp_ns": stamp_ns, "version": 1, "status": "LOST", "metrics": words}
         return msgspec.msgpack.encode(fields)

@@ -50,7 +50,7 @@ def disk_mb(folder: Path) -> float:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("flood") / "store"
     with MapStore.open(folder, create=True) as store:
         publish_samples(store, 1)

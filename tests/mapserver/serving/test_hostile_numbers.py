@@ -32,7 +32,7 @@ def test_a_number_that_none_can_mean_is_refused_where_it_is_decoded(kind: type[m
 
 
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(tmp_path: Path, monkeypatch) -> Iterator[Server]:
     monkeypatch.setattr(RateLimit, "admits", lambda *_: True)
     with served_api(tmp_path / "store", tmp_path / "inbox") as made:
         install_dashboard(made.client.app, made.store, made.fleet, ApiSettings())

@@ -111,7 +111,7 @@ def a_door(*, is_behind_proxy: bool = False, **tls: Any) -> Iterator[Door]:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch) -> None:
     for name, value in (("HEAD_S", 0.4), ("_TAKEN_S", 0.4), ("_LOOK_EVERY_S", 0.05)):
         monkeypatch.setattr(module, name, value)
 
@@ -150,7 +150,7 @@ def test_who_makes_no_progress_is_ended_and_who_does_is_not(tmp_path: Path) -> N
             assert one.recv(12) == b"HTTP/1.1 200"
 
 
-def test_a_large_answer_may_take_longer_than_a_head(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_answer_may_take_longer_than_a_head(monkeypatch) -> None:
     monkeypatch.setattr(module, "_LOOK_EVERY_S", 0.05)
     monkeypatch.setattr(module, "HEAD_S", 0.2)
     with a_door() as door, door.connect(GET % (b"large", b"")) as robot:
@@ -162,7 +162,7 @@ def test_a_large_answer_may_take_longer_than_a_head(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("is_behind_proxy", [False, True])
-def test_connections_are_shared_among_addresses(monkeypatch: pytest.MonkeyPatch, is_behind_proxy: bool) -> None:
+def test_connections_are_shared_among_addresses(monkeypatch, is_behind_proxy: bool) -> None:
     monkeypatch.setattr(module, "MAX_OF_ADDRESS", 4)
     monkeypatch.setattr(module, "MAX_CONNECTIONS", 8)
     with a_door(is_behind_proxy=is_behind_proxy) as door, ExitStack() as stack:
@@ -187,7 +187,7 @@ def test_connections_are_shared_among_addresses(monkeypatch: pytest.MonkeyPatch,
             assert time.monotonic() < deadline
 
 
-def test_files_are_kept_for_the_store_and_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_kept_for_the_store_and_the_bus(monkeypatch) -> None:
     monkeypatch.setattr(module, "MAX_OF_ADDRESS", 10_000)
     with a_door() as door:
         assert is_answered(door, "127.0.0.1")

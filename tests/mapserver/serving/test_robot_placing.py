@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused_and_nobody_hears_it(
     assert "robot placed" not in {event.kind for event in server.store.events("lab")}
 
 
-def test_a_robot_that_is_away_is_not_told(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_is_away_is_not_told(server: Server, monkeypatch) -> None:
     def answered(seconds_since: float, present: list[tuple[str, str]]) -> int:
         server.fleet.take_presence(present)
         heard_ns = server.fleet._robots["lab", "r1"].seen_ns

@@ -25,7 +25,7 @@ def rewrite(folder: Path, *statements: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory) -> Path:
     """A signed store of some releases."""
     folder = tmp_path_factory.mktemp("audit") / "store"
     with MapStore.open(folder, create=True) as store:

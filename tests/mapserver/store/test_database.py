@@ -76,9 +76,7 @@ def test_a_store_of_the_first_day_with_named_migrations_opens(tmp_path: Path) ->
         assert store.sites() == []
 
 
-def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(tmp_path: Path, monkeypatch) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
 

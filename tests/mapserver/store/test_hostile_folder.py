@@ -116,7 +116,7 @@ def modes(folder: Path) -> set[str]:
     return {oct(stat.S_IMODE(path.stat().st_mode)) for path in (folder, *folder.rglob("*"))}
 
 
-def test_a_store_is_for_its_owner_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_store_is_for_its_owner_alone(tmp_path: Path, capsys) -> None:
     before = os.umask(0)
     try:
         plain = tmp_path / "plain"

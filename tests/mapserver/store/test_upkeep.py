@@ -174,9 +174,7 @@ def test_a_damaged_version_is_not_exported(store: MapStore, tmp_path: Path) -> N
     assert list(tmp_path.glob("*lab*")) == []
 
 
-def test_days_until_the_disk_is_full_are_known_after_a_day(
-    store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_days_until_the_disk_is_full_are_known_after_a_day(store: MapStore, clock: Clock, monkeypatch) -> None:
     """1 GB a day of 100 free ones, and a build that takes half of them for an hour."""
     free = [100e9]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=10**12, free=int(free[0])))

@@ -239,7 +239,7 @@ def test_as_all_pairs_say(noise: float) -> None:
     assert found[:180].mean() < 0.3
 
 
-def test_a_part_of_the_others_finds_what_repeats_often(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_of_the_others_finds_what_repeats_often(monkeypatch) -> None:
     points, descriptors = racks(np.random.default_rng(3), 30, 40, 0.05)
     monkeypatch.setattr(module, "_REACH", 0)
     monkeypatch.setattr(module, "_MOST_COMPARED", 20)

@@ -44,7 +44,7 @@ def test_tiles_hold_what_a_plain_loop_finds() -> None:
     assert 5 in unseen
 
 
-def test_places_list_the_best_observed_landmarks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_list_the_best_observed_landmarks(monkeypatch) -> None:
     monkeypatch.setattr(tiling, "MAX_PLACE_LANDMARKS", 10)
     survey = random_survey(np.random.default_rng(5))
     counts = np.bincount(survey.obs_landmark, minlength=len(survey.landmark_ids))

@@ -64,9 +64,7 @@ def test_certificates_that_nobody_would_believe_are_errors(tmp_path: Path, autho
         ("an open key", "chmod o="),
     ],
 )
-def test_what_clients_will_refuse_is_told(
-    tmp_path: Path, authority: Authority, caplog: pytest.LogCaptureFixture, case: str, words: str
-) -> None:
+def test_what_clients_will_refuse_is_told(tmp_path: Path, authority: Authority, caplog, case: str, words: str) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
     hosts = {"another name": ["other.example", "10.0.0.1"]}.get(case, ["maps.example"])
     certificate = authority.sign(key.public_key(), "h", 5.001 if case == "ends soon" else 100, hosts=hosts)

@@ -97,9 +97,7 @@ def test_nothing_is_told_before_the_first_list(tmp_path: Path, clock: Clock) -> 
         assert (told(store, 1), trust_status(store).faults) == (1, [])
 
 
-def test_two_servers_do_not_make_the_keys_of_a_store_at_once(
-    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_servers_do_not_make_the_keys_of_a_store_at_once(tmp_path: Path, clock: Clock, monkeypatch) -> None:
     made = []
 
     def make(keys: KeyFolder, name: str) -> CryptoSigner:
@@ -117,7 +115,7 @@ def test_two_servers_do_not_make_the_keys_of_a_store_at_once(
     assert made == ["root", "online"]
 
 
-def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock, monkeypatch) -> None:
     lists = SignedLists(store.folder)
 
     def numbers() -> tuple[int, int, int]:
@@ -256,7 +254,7 @@ def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapSto
     assert len(trust_status(store).risks) == 3
 
 
-def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch) -> None:
     words = make_passphrase()
     assert len(words.replace("-", "")) * 5 == 80
     path = tmp_path / "keys" / "root-ada.pem"
@@ -283,7 +281,7 @@ def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pyt
     assert len(list((tmp_path / "keys").glob("online*.old"))) == 1
 
 
-def test_damaged_lists_do_not_undo_a_release(store: MapStore, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_lists_do_not_undo_a_release(store: MapStore, caplog) -> None:
     """Robots stay on the version before, and the server says why, at every attempt."""
     (store.folder / "trust" / "timestamp.json").write_text("{")
     assert publish(store, seed=2) == 2

@@ -24,9 +24,7 @@ from support.waiting import eventually
 
 
 @pytest.mark.parametrize("status", [301, 307, 308, 404, 500])
-def test_no_redirect_is_followed_and_attempts_end(
-    status: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_redirect_is_followed_and_attempts_end(status: int, monkeypatch, caplog) -> None:
     monkeypatch.setattr(alert_messages, "_PAUSES_S", (0.01, 0.01, 0.01))
     with receiver() as (elsewhere, led), receiver(status, elsewhere) as (address, got):
         sender = Webhook(AlertSettings(webhook=address))
@@ -46,9 +44,7 @@ def test_no_redirect_is_followed_and_attempts_end(
         (b"HTTP/1.1 200 OK\r\n" + b"A: b\r\n" * 500, False),
     ],
 )
-def test_a_hostile_receiver_is_left_after_its_time(
-    says: bytes, is_taken: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hostile_receiver_is_left_after_its_time(says: bytes, is_taken: bool, monkeypatch) -> None:
     """One that says nothing, those that send a byte now and then for ever, nonsense, and too many headers."""
     monkeypatch.setattr(alert_messages, "_ATTEMPT_S", 0.4)
     ended = threading.Event()
@@ -72,7 +68,7 @@ def test_a_hostile_receiver_is_left_after_its_time(
         thread.join()
 
 
-def test_a_dead_receiver_costs_a_bounded_queue(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_dead_receiver_costs_a_bounded_queue(caplog) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     sender = Webhook(AlertSettings(webhook=f"http://127.0.0.1:{port}/"))

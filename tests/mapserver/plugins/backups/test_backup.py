@@ -41,7 +41,7 @@ def target(tmp_path: Path) -> BackupTarget:
 
 
 @pytest.fixture(params=["folder", "s3"])
-def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def where(request, tmp_path: Path) -> str:
     return str(tmp_path / "backups") if request.param == "folder" else f"{request.getfixturevalue('s3')}-backups"
 
 
@@ -206,7 +206,7 @@ def test_a_clock_that_was_ahead_hides_no_later_snapshot(
 
 
 def test_a_target_that_fails_is_not_a_store_that_lost_something(
-    store: MapStore, target: BackupTarget, monkeypatch: pytest.MonkeyPatch
+    store: MapStore, target: BackupTarget, monkeypatch
 ) -> None:
     back_up(store, target, keep=1)
     before = target.snapshots()
@@ -225,7 +225,7 @@ def test_a_target_that_fails_is_not_a_store_that_lost_something(
 
 
 def test_a_folder_with_something_in_it_stays_as_it_is(
-    store: MapStore, tmp_path: Path, target: BackupTarget, monkeypatch: pytest.MonkeyPatch
+    store: MapStore, tmp_path: Path, target: BackupTarget, monkeypatch
 ) -> None:
     back_up(store, target)
     disk = tmp_path / "disk"  # a new file system
@@ -253,9 +253,7 @@ def test_what_counts_restorations_is_bounded(store: MapStore, tmp_path: Path, ta
     assert {path.name for path in (tmp_path / "newer").iterdir()} == {"lock"}
 
 
-def test_keys_that_only_the_unit_can_read_come_back(
-    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_keys_that_only_the_unit_can_read_come_back(store: MapStore, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "credentials").mkdir()
     for name in ("online", "root", "site-lab"):
         (tmp_path / "credentials" / f"fleetmap-{name}").write_text("a passphrase of the unit")
@@ -297,7 +295,7 @@ def follow(robot: Path, root: bytes, store: MapStore) -> SignedLists:
     return lists
 
 
-def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, s3: str, monkeypatch) -> None:
     with pytest.raises(UsageError, match="holds no backups"):
         BackupTarget(str(tmp_path / "nothing"))
     target = BackupTarget(str(tmp_path / "backups"), create=True)

@@ -51,7 +51,7 @@ def test_a_cluster_makes_the_same_map(cluster: Client) -> None:
     assert surveyed_by(Cluster(cluster)) == surveyed_by(SERIAL)
 
 
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_is_told(monkeypatch) -> None:
     monkeypatch.setattr(dask_clusters, "_CONNECT_WITHIN_S", 1.0)
     for address in ("tls://127.0.0.1:9", "tls://nonsense"):
         with pytest.raises(UsageError, match="does not answer"), open_executor(1, address):
@@ -83,7 +83,7 @@ def test_a_cluster_that_is_lost_is_told() -> None:
             list(found)
 
 
-def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_without_workers_is_told(monkeypatch) -> None:
     monkeypatch.setattr(dask_clusters, "_CONNECT_WITHIN_S", 2.0)
     with (
         tls_cluster(0) as there,

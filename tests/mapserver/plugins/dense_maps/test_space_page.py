@@ -84,7 +84,7 @@ def test_bytes_hold_all_landmarks_and_places() -> None:
     assert len(data) == 8 + 12 * count + 48 * places + count
 
 
-def test_too_many_landmarks_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_landmarks_are_thinned(monkeypatch) -> None:
     monkeypatch.setattr(points, "MAX_LANDMARKS", 30)
     count, _ = np.frombuffer(space_bytes(tiles()), "<u4", 2)
     assert 20 <= count <= 30
@@ -288,7 +288,7 @@ def test_the_expected_view_stands_beside_the_picture(page: Page, tmp_path: Path)
 
 
 @pytest.fixture(scope="module")
-def walked(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def walked(browser: Chromium, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     extras, said = surfel_extras(rack_surfels())
     fill_shift(folder, extras, surfels=said)

@@ -193,7 +193,7 @@ def chosen(label: str) -> dict[str, int]:
     return {"version": 4} if label.endswith("/pictures") else {}
 
 
-def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch) -> None:
     asked = answers(tmp_path, monkeypatch, fill, chosen, r"/(grid|view|changes|expected)\.|/pictures(/\{sha256\})?$")
     assert len(asked) >= 8
     for label, statuses in asked.items():

@@ -33,7 +33,7 @@ OTHER_FROM_MAP = se3(so3_exp(np.array([0.4, -0.3, 0.2])), np.array([3.0, 1.0, 0.
 
 
 @pytest.fixture(autouse=True)
-def followed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def followed_once(monkeypatch) -> None:
     """Our odometry runs once over the same frames."""
     follow = given_module._followed
 
@@ -211,7 +211,7 @@ def test_poses_of_another_recording_are_refused(room_ride: Path, tmp_path: Path,
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
 def test_a_build_from_poses_makes_a_map_of_them(
-    room_ride: Path, tmp_path: Path, use: SensorSet | None, monkeypatch: pytest.MonkeyPatch
+    room_ride: Path, tmp_path: Path, use: SensorSet | None, monkeypatch
 ) -> None:
     """Upright too, though the frame of the poses is not: by gravity, or by how the body began."""
     monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun := Mock(side_effect=poses_as_odometry))

@@ -95,7 +95,7 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("recordings") / "kidnapped", kidnapped())
 
 
@@ -115,7 +115,7 @@ class Drive:
 
 
 @pytest.fixture(scope="module")
-def whole(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def whole(recording: Path, tmp_path_factory) -> Drive:
     return Drive(recording, "::", tmp_path_factory.mktemp("whole"))
 
 

@@ -50,12 +50,12 @@ class Site:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+def site(tmp_path_factory) -> Site:
     return Site(tmp_path_factory.mktemp("site"))
 
 
 @pytest.fixture(autouse=True)
-def builds(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+def builds(monkeypatch) -> list[Call]:
     monkeypatch.setattr(live_command, "_stopping", threading.Event)
     return order_builds(monkeypatch)
 
@@ -108,9 +108,7 @@ def drive(site: Site, record: Path, sensors: "Scripted", names: Topics) -> list[
     return told
 
 
-def test_what_a_build_would_refuse_is_refused_before_the_drive(
-    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_build_would_refuse_is_refused_before_the_drive(site: Site, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(MappingHere, "start", lambda *_: pytest.fail("the drive began"))
     config = configured(tmp_path, site, SensorSet.STEREO)
     other = tmp_path / "other.yaml"
@@ -151,9 +149,7 @@ class Scripted:
         """Nothing is open."""
 
 
-def test_sensors_that_say_nothing_are_not_waited_for(
-    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sensors_that_say_nothing_are_not_waited_for(site: Site, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(drives, "_SILENCE_S", 0.2)
     record, sample = tmp_path / "drive.mcap", robot_world.cycle()
     names = Topics(left="/front/left", right="/front/right")

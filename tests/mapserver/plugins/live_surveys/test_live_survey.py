@@ -39,12 +39,12 @@ Finished = tuple[tuple[LiveFigures, BuiltMap], list[LiveSurveyState], Path]
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", make_sample(FRAMES))
 
 
 @pytest.fixture(scope="module")
-def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def finished(recording: Path, tmp_path_factory) -> Finished:
     """A whole drive at its own speed, all that was told of it, and its store."""
     store, told = tmp_path_factory.mktemp("store") / "maps", list[LiveSurveyState]()
     with played(recording, store) as drive:
@@ -83,7 +83,7 @@ def test_the_draft_is_what_a_build_makes_of_the_recording(finished: Finished, re
 
 
 @pytest.fixture
-def ordered(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+def ordered(monkeypatch) -> list[Call]:
     return order_builds(monkeypatch)
 
 

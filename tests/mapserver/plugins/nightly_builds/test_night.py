@@ -90,7 +90,7 @@ def built(
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch) -> None:
     monkeypatch.setattr(night, "build_draft", built)
     monkeypatch.setattr(recordings, "_read", lambda path, options, _: read(path, options))
 
@@ -109,9 +109,7 @@ def spend(folder: Path, **more: Any) -> str:
     return run_night(order, GateSettings(), Console(file=io.StringIO()))
 
 
-def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
-    hall: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(hall: Path, monkeypatch) -> None:
     config, build = hall / "site.toml", Mock(side_effect=built)
     config.write_text("[survey]\nseed = 5\n")
     monkeypatch.setattr(night, "build_draft", build)
@@ -208,9 +206,7 @@ def test_a_recording_that_the_doctor_refuses_does_not_stop_the_others(hall: Path
             admit(*paths, unusable=taken)
 
 
-def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
-    hall: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(hall: Path, monkeypatch) -> None:
     spend(hall)
     record(hall / "inbox", "wednesday", 3)
     monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10))
@@ -229,7 +225,7 @@ def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
     assert "version 3 published" in spend(hall)
 
 
-def test_what_the_gate_refuses_takes_no_other_recording_with_it(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_gate_refuses_takes_no_other_recording_with_it(hall: Path, monkeypatch) -> None:
     spend(hall)
     for seed, name in enumerate(("wednesday", "thursday"), 3):
         record(hall / "inbox", name, seed)
@@ -341,9 +337,7 @@ def test_a_folder_of_the_inbox_that_is_a_link_moves_nothing(hall: Path, where: s
     assert names(outside) == ["store.mcap"]
 
 
-def test_who_writes_a_recording_while_it_is_looked_at_ends_no_night(
-    hall: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_writes_a_recording_while_it_is_looked_at_ends_no_night(hall: Path, monkeypatch) -> None:
     """A file lease that is broken sends SIGIO, which ends a process."""
     control = fcntl.fcntl
 
@@ -362,7 +356,7 @@ def test_who_writes_a_recording_while_it_is_looked_at_ends_no_night(
     assert heard == []
 
 
-def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_waits_without_a_word(hall: Path, monkeypatch) -> None:
     """What is left where it is, is named: no recordings, what cannot be moved, what changes while it is read, and what is too much."""
     for name in ("notes.txt", "photo.png", "x.mcap", "y.mcap", "z.mcap"):
         (hall / "inbox" / name).write_bytes(b"no MCAP")
@@ -420,7 +414,7 @@ def test_files_that_may_not_be_read_end_no_night() -> None:
 
 @pytest.mark.parametrize("where", ["read", "built", "joined", "broken"])
 def test_what_ended_two_nights_is_set_aside_by_the_third_and_nothing_beside_it(
-    hall: Path, where: str, monkeypatch: pytest.MonkeyPatch
+    hall: Path, where: str, monkeypatch
 ) -> None:
     """Killed while one recording is read, surveyed or joined with the others, as by the kernel; a fault of the program ends no night."""
     fatal = record(hall / "inbox", "fatal", 5)
@@ -477,7 +471,7 @@ def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
     ("limit", "value", "said"),
     [("_READ_S", 0.05, "was ended after 0 s"), ("_most_memory_bytes", lambda: 1 << 20, "monday")],
 )
-def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: object, said: str) -> None:
+def test_reading_has_limits(hall: Path, monkeypatch, limit: str, value: object, said: str) -> None:
     monkeypatch.setattr(recordings, "_read", READ)
     assert isinstance(identify(hall / "inbox/monday", OpenOptions()), InboxRecording)
     monkeypatch.setattr(recordings, limit, value)
@@ -556,9 +550,7 @@ def test_a_night_that_was_killed_or_ran_out_of_space_is_gone_on_with(hall: Path,
     assert resumed > 2
 
 
-def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
-    hall: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_draft_that_a_killed_night_left_is_published_without_building_again(hall: Path, monkeypatch) -> None:
     with patch.object(releases, "publish", side_effect=CancelledError), pytest.raises(CancelledError):  # as if killed
         spend(hall)
     monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))
@@ -568,9 +560,7 @@ def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
         assert "was interrupted; job 2 goes on" in maps.job(1).message
 
 
-def test_the_command_says_how_it_ended(
-    hall: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_how_it_ended(hall: Path, monkeypatch, capsys) -> None:
     def run(*more: str) -> int:
         words = ["nightly", "--site", "hall", "--inbox", hall / "inbox", "--store", hall / "store"]
         return status("mapserver", *words, "--settle-s", "0", *more)

@@ -74,9 +74,7 @@ def test_damaged_content_is_not_moved(store: MapStore, s3: str) -> None:
     assert read_places(folder).content != other
 
 
-def test_an_object_store_that_does_not_answer_is_no_damage(
-    tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_object_store_that_does_not_answer_is_no_damage(tmp_path: Path, s3: str, monkeypatch) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
         publish_samples(store, 1)
     MapStore.attach(tmp_path / "store", Places(s3))

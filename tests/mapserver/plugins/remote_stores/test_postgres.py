@@ -90,9 +90,7 @@ def test_one_leads_until_it_is_gone(folders: tuple[Path, Path], postgres: Postgr
 
 
 @pytest.mark.parametrize("end", ["COMMIT", "ROLLBACK", "COMMIT later", "COMMIT of another database"])
-def test_a_commit_without_an_answer_counts_once(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, end: str
-) -> None:
+def test_a_commit_without_an_answer_counts_once(folders: tuple[Path, Path], monkeypatch, end: str) -> None:
     with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
         real = PostgresDatabase.run
         asked = threading.Event()
@@ -128,7 +126,7 @@ def test_a_commit_without_an_answer_counts_once(
         assert chain_faults(store.log()[::-1]) == []
 
 
-def test_a_write_does_not_wait_for_the_leader(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_does_not_wait_for_the_leader(folders: tuple[Path, Path], monkeypatch) -> None:
     """The network of the session that leads is slow."""
     with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
         assert store.leads()
@@ -258,9 +256,7 @@ def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
         assert chain_faults(lines) == []
 
 
-def test_who_waited_in_vain_for_its_turn_leaves_no_transaction(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_waited_in_vain_for_its_turn_leaves_no_transaction(folders: tuple[Path, Path], monkeypatch) -> None:
     monkeypatch.setattr(postgres_module, "_OPTIONS", f"{postgres_module._OPTIONS} -c lock_timeout=100ms")
     with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
         with store._database.write(), pytest.raises(StoreError, match="lock timeout"):
@@ -346,9 +342,7 @@ def test_a_shared_store_moves_only_with_its_server_stopped_and_not_on(
             MapStore.attach(tmp_path, places)
 
 
-def test_nobody_writes_what_is_not_copied(
-    tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nobody_writes_what_is_not_copied(tmp_path: Path, postgres: PostgresServer, monkeypatch) -> None:
     with MapStore.open(tmp_path, create=True):
         pass
     copy, tried = PostgresDatabase.copy_from, list[str]()

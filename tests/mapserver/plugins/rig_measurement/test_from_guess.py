@@ -118,7 +118,7 @@ def test_a_damaged_picture_costs_its_frame(tmp_path: Path, image_type: str) -> N
     assert "corrections to the calibration" in done.stdout
 
 
-def test_the_other_cameras_of_a_rig_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_other_cameras_of_a_rig_are_kept(tmp_path: Path, monkeypatch) -> None:
     """The first pair's baseline is 1 % longer; the file has all four cameras, the others as they were."""
     sample, front = make_sample(4), calibration(has_imu=False)
     turned = se3(np.diag([-1.0, -1.0, 1.0]), np.array([-0.3, 0.0, 0.0]))  # body_from_turned

@@ -67,7 +67,7 @@ def matrix_of(solver: core.BundleSolver) -> Array:
 
 
 @pytest.fixture(params=PATTERNS)
-def pairs(request: pytest.FixtureRequest) -> list[tuple[int, int]]:
+def pairs(request) -> list[tuple[int, int]]:
     return [(i, j) for i, j in PATTERNS[request.param](np.random.default_rng(1)) if i != j]
 
 

@@ -120,7 +120,7 @@ def made_up_map(letters: str) -> Any:
     ],
 )
 def test_sessions_join_when_what_they_need_is_there(
-    sessions: str, needs: dict[str, str], tried: str, in_map: str, monkeypatch: pytest.MonkeyPatch
+    sessions: str, needs: dict[str, str], tried: str, in_map: str, monkeypatch
 ) -> None:
     """Small letters have position priors: they are tried as they come, the others behind them, what failed until nothing grows."""
     sites = Sites(needs)
