@@ -6,17 +6,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from fleetmap.errors import FleetmapError, MapFormatError, UnreachableError
-from fleetmap.mapformat.building import (
-    ALIGNMENT,
-    AREAS,
-    FLOORS,
-    MAX_FLOORS_BYTES,
-    BuildingFrame,
-    Floor,
-    aligned_frame,
-    read_building,
-    read_lifts,
-)
+from fleetmap.mapformat import building as building_files
+from fleetmap.mapformat.building import AREAS, BuildingFrame, Floor
 from fleetmap.messages import WantedVersion
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
@@ -56,12 +47,12 @@ class BuildingMaps:
     def refresh(self, *, asks: bool = True) -> None:
         """Read everything anew; asks: False reads the disk alone. UnreachableError without an answer of a server; all else is logged."""
         try:
-            data = self._own.site_file(FLOORS, MAX_FLOORS_BYTES)
-            entries = () if data is None else read_building(data).floors
+            data = self._own.site_file(building_files.FLOORS, building_files.MAX_FLOORS_BYTES)
+            entries = () if data is None else building_files.read_building(data).floors
             if entries and self._own.site not in {entry.site for entry in entries}:
                 raise MapFormatError(f"the building of site {self._own.site} has no such floor; set it again")
-            alone = None if entries else self._own.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
-            frame_alone = None if alone is None else aligned_frame(alone)
+            alone = None if entries else self._own.site_file(building_files.ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+            frame_alone = None if alone is None else building_files.aligned_frame(alone)
         except UnreachableError:
             raise
         except FleetmapError as error:
@@ -76,14 +67,14 @@ class BuildingMaps:
                 source = self._sources[key] if key else self._own
                 # First: it reads the signed list, which names the files
                 loaded = self._newest(source, asks=asks) if key else None
-                if key and source.site_file(FLOORS, MAX_FLOORS_BYTES) != data:
+                if key and source.site_file(building_files.FLOORS, building_files.MAX_FLOORS_BYTES) != data:
                     raise MapFormatError(f"site {key} does not name this building's floors; set the building again")
-                alignment = source.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+                alignment = source.site_file(building_files.ALIGNMENT, _MAX_ALIGNMENT_BYTES)
                 if alignment is None:
                     reason = f"site {entry.site} has no pose in the building; `mapserver align` estimates it"
                     raise MapFormatError(reason)
-                frame, areas = aligned_frame(alignment), source.site_file(AREAS, _MAX_AREAS_BYTES)
-                floors[key] = Floor(entry, frame, read_lifts(areas, frame))
+                frame, areas = building_files.aligned_frame(alignment), source.site_file(AREAS, _MAX_AREAS_BYTES)
+                floors[key] = Floor(entry, frame, building_files.read_lifts(areas, frame))
                 files += [alignment, areas]
                 maps += [] if loaded is None else [loaded]
                 self._note(entry.site, "")

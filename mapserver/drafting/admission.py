@@ -77,7 +77,7 @@ class CheckedRecording:
         return [*words, *held, *([said] if done else [])]
 
 
-def leaves_wheels_out(findings: Sequence[Finding]) -> bool:
+def drops_wheels(findings: Sequence[Finding]) -> bool:
     """True if all other sensors contradict the wheels."""
     return any(f.name == WHEELS and f.verdict is Verdict.FAIL for f in findings)
 
@@ -117,7 +117,7 @@ def checked(
     refuse = partial(_refuse, recording)
     checks = run_checks(recording, on_frame, executor, follow, refuse)
     refuse(checks.findings)
-    used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
+    used = replace(recording, wheel=()) if drops_wheels(checks.findings) else recording
     given = fingerprint(recording.calibration)
     gyro_s = checks.gyro.offset_s if checks.gyro is not None and checks.gyro.is_sure else None
     held = _unconfirmed(checks, gyro_s)

@@ -28,14 +28,7 @@ from mapserver.calibration.recordings import LONGEST_S, busiest_frames, busiest_
 from mapserver.doctor.calibration import SURE_SIGMAS
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import (
-    DECISIVE,
-    PAIR,
-    CheckedRecording,
-    checked,
-    leaves_wheels_out,
-    with_further_views,
-)
+from mapserver.drafting.admission import DECISIVE, PAIR, CheckedRecording, checked, drops_wheels, with_further_views
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.worker import read_ahead
@@ -364,7 +357,7 @@ def _admission(
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         if reading.trajectory is None:
-            has_wheels = len(first.wheel) > 0 and not leaves_wheels_out(result.findings)
+            has_wheels = len(first.wheel) > 0 and not drops_wheels(result.findings)
             return Admission(result, begun=None if begun is None else begun.chain_of(result.rig, has_wheels=has_wheels))
         given = reading.trajectory.poses_of(replace(first, calibration=result.rig), indices)
         console.print(f"{recording.name}: {given.words}", markup=False)
@@ -387,7 +380,7 @@ def survey_recording(
     with reading.open(path) as (opened, indices):
         rig = with_other_views(found.rig, opened.calibration)
         recording = replace(opened, calibration=rig)
-        if leaves_wheels_out(found.findings):
+        if drops_wheels(found.findings):
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)

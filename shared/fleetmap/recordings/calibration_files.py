@@ -38,14 +38,8 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.images import StoredImage, decode_grey
 from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_IMAGE_BYTES
-from fleetmap.sensors.calibration import (
-    CameraCalibration,
-    ImuNoise,
-    Polygon,
-    RigCalibration,
-    check_camera,
-    hidden_pixels,
-)
+from fleetmap.sensors import calibration as rigs
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, Polygon, RigCalibration, check_camera
 from fleetmap.sensors.cameras import LENSES, PLANE, lens_of
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -359,7 +353,7 @@ def _mask(values: Section, size_px: tuple[int, int]) -> tuple[Polygon, ...]:
         if (high < 0).any() or (low > np.array(size_px) - 1).any():
             where = f"the polygon from {low.tolist()} to {high.tolist()} lies outside of the {size_px[0]}x{size_px[1]} image"
             raise values.error(f"mask: {where}; is it for another resolution?")
-    if hidden_pixels(polygons, size_px).all():
+    if rigs.hidden_pixels(polygons, size_px).all():
         raise values.error("mask hides the whole image; of an image as mask, 0 is what may be used")
     return polygons
 

@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, Array32, Mask, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.calibration import (
-    LEAST_BASELINE_M,
-    SIDEWAYS,
-    CameraCalibration,
-    Polygon,
-    RigCalibration,
-    hidden_pixels,
-)
+from fleetmap.sensors import calibration as rigs
+from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration
 from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
@@ -255,11 +249,11 @@ def _rectifying_rotation(
     cam0_from_cam1 = se3_inverse(left.body_from_cam) @ right.body_from_cam
     baseline_cam0 = cam0_from_cam1[:3, 3]
     baseline_m = float(np.linalg.norm(baseline_cam0))
-    if baseline_m < LEAST_BASELINE_M:
+    if baseline_m < rigs.LEAST_BASELINE_M:
         raise CalibrationError(
             f"cam{numbers[0]} and cam{numbers[1]} are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
         )
-    if baseline_cam0[0] < SIDEWAYS * baseline_m:
+    if baseline_cam0[0] < rigs.SIDEWAYS * baseline_m:
         raise CalibrationError(
             f"cam{numbers[1]} lies at {np.round(baseline_cam0, 4).tolist()} m in cam{numbers[0]}'s axes, not to its right; "
             "are left and right swapped?"
@@ -294,7 +288,7 @@ def _remap_tables(
         at = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
         inside = np.asarray(((at >= 0) & (at < size_px)).all(axis=2))
         columns, rows = np.moveaxis(np.where(inside[..., None], at, 0), 2, 0)
-        hidden = np.logical_and(inside, hidden_pixels(mask, size_px)[rows, columns])
+        hidden = np.logical_and(inside, rigs.hidden_pixels(mask, size_px)[rows, columns])
         pixels = np.where(hidden[..., None], np.nan, pixels)
     same_size = (rectified.width_px, rectified.height_px) == size_px
     if same_size and np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():

@@ -15,17 +15,10 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
+from fleetmap.recordings import images as image_files
 from fleetmap.recordings.files import hash_file, lines_of, read_text, what_instead
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, rig_views
-from fleetmap.recordings.images import (
-    StoredFrame,
-    StoredImage,
-    decode_depth,
-    decode_frame,
-    file_kind,
-    image_size,
-    is_cut,
-)
+from fleetmap.recordings.images import StoredFrame, StoredImage, file_kind
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
 from fleetmap.recordings.ordering import LAST_NS, ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
 from fleetmap.recordings.png import is_damaged_png
@@ -94,13 +87,13 @@ class RegisteredFrames(SeriesFrames):
         """Frame `index` with its images as stored; depth as PNG in whole mm."""
         stored = super().stored(index)
         depth: Any = stored.depth
-        depth_mm = self._registered_mm(decode_depth(depth), depth.where)
+        depth_mm = self._registered_mm(image_files.decode_depth(depth), depth.where)
         _, png = cv2.imencode(".png", depth_mm.astype(np.uint16))
         return replace(stored, depth=StoredImage("file", png.tobytes(), depth.where))
 
     def frame(self, index: int) -> CameraFrame:
         stored: Any = super().stored(index)
-        frame = decode_frame(stored)
+        frame = image_files.decode_frame(stored)
         depth_m: Any = frame.depth_m
         depth_mm = self._registered_mm(depth_m, stored.depth.where)
         return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
@@ -167,9 +160,9 @@ def _fault_and_size(path: Path, file_bytes: int) -> tuple[str, tuple[int, int] |
         return f"that cannot be read ({error.strerror})", None
     if fault := what_instead(head):
         return f"that are {fault}", None
-    if is_damaged or is_cut(head, tail):
-        return "cut off" if is_cut(head, tail) else "damaged inside", None
-    size_px = image_size(head)
+    if is_damaged or image_files.is_cut(head, tail):
+        return "cut off" if image_files.is_cut(head, tail) else "damaged inside", None
+    size_px = image_files.image_size(head)
     if size_px is None and file_kind(head) == "other" and not head.startswith((b"II*\0", b"MM\0*")):
         return "of no format that is read", None  # the header of a TIFF file may be at its end
     return "", size_px

@@ -15,15 +15,8 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Mask
-from fleetmap.plugins.other_recorders.calibration import (
-    calibration_of_messages,
-    camera_poses,
-    frames_not_optical,
-    info_of_images,
-    last_links,
-    same_lens,
-    setting_of,
-)
+from fleetmap.plugins.other_recorders import calibration as rig_messages
+from fleetmap.plugins.other_recorders.calibration import setting_of
 from fleetmap.plugins.other_recorders.decoders import ENCODINGS, IMU_TYPES, CameraInfo
 from fleetmap.recordings.calibration_files import CalibrationFile
 from fleetmap.recordings.mcap import streams as mcap_streams
@@ -184,7 +177,7 @@ class _InfoStream(Stream):
             lens = None
         if self.lens is None:
             self.messages, self.log_times_ns = [], []
-        elif lens is None or same_lens(lens, self.lens):
+        elif lens is None or rig_messages.same_lens(lens, self.lens):
             return
         self.lens = lens
         super().take(data, place, logged_ns, log)
@@ -276,7 +269,7 @@ def _lens(role: str, images: Sequence[ImageStream], streams: Sequence[Stream], l
         return _Lens(None, np.ones(len(stamps_ns), np.bool_))
     infos, numbers = list[CameraInfo](), list[int]()
     for _, info in told:
-        number = next((n for n, lens in enumerate(infos) if same_lens(lens, info)), len(infos))
+        number = next((n for n, lens in enumerate(infos) if rig_messages.same_lens(lens, info)), len(infos))
         numbers.append(number)
         infos += [info] if number == len(infos) else []
         if len(infos) > _MOST_LENSES:
@@ -332,7 +325,7 @@ def _calibration(
         sizes_px = [size_px for stream in roles[side] for *_, size_px in stream.images]
         used = [size for size, is_usable in zip(sizes_px, lens.usable, strict=True) if is_usable]
         size_px = Counter(used).most_common(1)[0][0]
-        info = info_of_images(lens.info, size_px, f"{container.path}: {image_topic}")
+        info = rig_messages.info_of_images(lens.info, size_px, f"{container.path}: {image_topic}")
         if info.binning != (1, 1) or info.roi[:2] != (0, 0):
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
@@ -342,20 +335,20 @@ def _calibration(
         cameras.append(info)
     said = [value for stream in roles.get("tf_static", ()) for value in stream.values]
     said.sort(key=lambda value: value[0])
-    links, changes = last_links([link for _, found in said for link in found])
+    links, changes = rig_messages.last_links([link for _, found in said for link in found])
     for words in changes:
         log.note("transform said twice", f"{words}; the last one is used, as tf2 does")
     for issue in dict.fromkeys(link.issue for link in links if link.issue):
         log.note("transform not sound", issue)
-    cam0_from_cams = camera_poses(cameras, links, str(container.path))
+    cam0_from_cams = rig_messages.camera_poses(cameras, links, str(container.path))
     for camera, side, cam0_from_cam in zip(cameras, sides, cam0_from_cams, strict=True):
         if cam0_from_cam is None:
             what = f"no transform connects {camera.frame} to {cameras[0].frame}"
             log.note("camera not mounted", f"{side}: {what}; its images are not used")
-    for words in frames_not_optical(cameras, links):
+    for words in rig_messages.frames_not_optical(cameras, links):
         log.note("camera frame not optical", words)
     mounted = tuple(side for side, mount in zip(sides, cam0_from_cams, strict=True) if mount is not None)
-    calibration = calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path))
+    calibration = rig_messages.calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path))
     if len(mounted) > 1:
         marked = zip(calibration.cameras, mounted, strict=True)
         placed = tuple(replace(camera, has_depth=f"{role}_depth" in roles) for camera, role in marked)
