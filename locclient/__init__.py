@@ -54,5 +54,4 @@ _NAMES = {
     "locclient.replay.run_result": "ReplayResult",
     "locclient.robot.robot": "Robot",
 }
-__all__ = [name for names in _NAMES.values() for name in names.split()]
-__getattr__, __dir__ = lazy_names(__name__, _NAMES)
+__all__, __getattr__, __dir__ = lazy_names(__name__, _NAMES)

@@ -16,20 +16,19 @@ from typing import TYPE_CHECKING
 from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from fleetmap.version import __version__
-    from mapserver.library import (
-        Actor,
-        BuildOptions,
-        BuiltMap,
-        GateSettings,
-        MapArrays,
-        MapStore,
-        build_map,
-        open_map,
-        open_store,
-    )
+    from fleetmap.version import __version__ as __version__
+    from mapserver.library import Actor as Actor
+    from mapserver.library import BuildOptions as BuildOptions
+    from mapserver.library import BuiltMap as BuiltMap
+    from mapserver.library import GateSettings as GateSettings
+    from mapserver.library import MapArrays as MapArrays
+    from mapserver.library import MapStore as MapStore
+    from mapserver.library import build_map as build_map
+    from mapserver.library import open_map as open_map
+    from mapserver.library import open_store as open_store
 
-__all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
-__all__ += ["__version__", "open_store"]
-_NAMES = {"mapserver.library": " ".join(__all__), "fleetmap.version": "__version__"}  # the last one has it
-__getattr__, __dir__ = lazy_names(__name__, _NAMES, extra="server")
+_NAMES = {
+    "fleetmap.version": "__version__",
+    "mapserver.library": "Actor BuildOptions BuiltMap GateSettings MapArrays MapStore build_map open_map open_store",
+}
+__all__, __getattr__, __dir__ = lazy_names(__name__, _NAMES, extra="server")

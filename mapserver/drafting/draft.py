@@ -23,22 +23,14 @@ from fleetmap.recordings import Recording, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting import draft_evidence, survey_recordings
+from mapserver.drafting import report as reports
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
 from mapserver.drafting.draft_evidence import Before, MappedSession
 from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
-from mapserver.drafting.report import (
-    BuildReport,
-    BuildResult,
-    library_versions,
-    loop_places,
-    make_report,
-    report_details,
-    sentence,
-    write_file,
-)
+from mapserver.drafting.report import BuildReport, BuildResult, sentence
 from mapserver.drafting.survey_recordings import Admission, OpenRecordings
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import accuracy, truth_from_estimate
@@ -176,7 +168,7 @@ def build_draft(
             if parent is not None:
                 parent = built.corrections.applied(parent)
             draft = _keep(run, built, parent, maps)
-            draft = replace(draft, report=draft.report | {"loop_places": loop_places(built)})
+            draft = replace(draft, report=draft.report | {"loop_places": reports.loop_places(built)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
             return draft, built
 
@@ -254,7 +246,7 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     evidence = msgspec.structs.replace(_evidence(run, built, sessions, tiles, parent), views=views)
     run.times.begin("storing")
     known_m = None if before is None else before.report.get("alias_step_m")
-    report = make_report(
+    report = reports.make_report(
         built,
         evidence,
         sum(run.times.seconds.values()),
@@ -297,7 +289,7 @@ def _details(
         camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
         recordings=tuple(s.entry for s in built.taken),
         configuration=_configuration(run, parent) | built.corrections.configuration(run.request.site),
-        libraries=library_versions(),
+        libraries=reports.library_versions(),
         # A robot downloads the manifest: its part about the build is short.
         report={key: value for key, value in report.items() if key not in _NOT_FOR_ROBOTS}
         | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=starts, views=None))},
@@ -364,8 +356,8 @@ def _write_files(run: _Run, built: BuildResult, draft: Draft) -> None:
     if options.trajectory_out is not None:
         write_tum(options.trajectory_out, built.joined.map.trajectory)
     if options.picture is not None:
-        write_file(options.picture, picture_png(site, draft, built))
+        reports.write_file(options.picture, picture_png(site, draft, built))
     if options.report is not None:
         full: dict[str, Any] = {"site": site, "version": draft.version}
-        full = draft.report | full | report_details(built, run.times.seconds)
-        write_file(options.report, to_json(full, indent=2) + b"\n")
+        full = draft.report | full | reports.report_details(built, run.times.seconds)
+        reports.write_file(options.report, to_json(full, indent=2) + b"\n")

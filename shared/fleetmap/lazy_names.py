@@ -8,8 +8,8 @@ from fleetmap.errors import FleetmapError
 
 def lazy_names(
     package: str, names: Mapping[str, str], extra: str = ""
-) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package. names: by module, its public names, separated by spaces.
+) -> tuple[list[str], Callable[[str], object], Callable[[], list[str]]]:
+    """Return `__all__`, `__getattr__` and `__dir__` of a package. names: by module, its public names, separated by spaces.
 
     extra: without its libraries `__getattr__` raises a FleetmapError that names the install command.
     """
@@ -26,4 +26,4 @@ def lazy_names(
             install = f"pip install '.[{extra}]' in fleetmap's source folder"
             raise FleetmapError(f"{package}.{name} needs {error.name}, which is not installed; {install}") from error
 
-    return imported, lambda: sorted(modules)
+    return list(modules), imported, lambda: sorted(modules)

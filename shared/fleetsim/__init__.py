@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fleetsim.scenarios import SCENARIOS
 
 __all__ = ["SCENARIOS", "Order", "Session", "__version__", "prepare", "record_order"]
-__getattr__, __dir__ = lazy_names(
+_, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "fleetmap.version": "__version__",

@@ -12,30 +12,18 @@ from pathlib import Path
 
 from fleetmap.errors import RecordingError
 from fleetmap.hooks import plugins
-from fleetmap.recordings.calibration_files import format_calibration, read_calibration
+from fleetmap.recordings.calibration_files import format_calibration as format_calibration
+from fleetmap.recordings.calibration_files import read_calibration as read_calibration
 from fleetmap.recordings.files import what_file_instead
-from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.images import StoredFrame as StoredFrame
+from fleetmap.recordings.images import StoredImage as StoredImage
 from fleetmap.recordings.mcap import reader
-from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, named_topics
-from fleetmap.sensors.source_settings import Topics
-
-__all__ = [
-    "RECORDING_FORMATS",
-    "FrameSelection",
-    "FrameSource",
-    "OpenOptions",
-    "Recording",
-    "RecordingFormat",
-    "StoredFrame",
-    "StoredImage",
-    "Topics",
-    "file_suffixes",
-    "format_calibration",
-    "named_topics",
-    "open_recording",
-    "read_calibration",
-    "recording_formats",
-]
+from fleetmap.recordings.recording import FrameSelection as FrameSelection
+from fleetmap.recordings.recording import FrameSource as FrameSource
+from fleetmap.recordings.recording import OpenOptions as OpenOptions
+from fleetmap.recordings.recording import Recording as Recording
+from fleetmap.recordings.recording import named_topics as named_topics
+from fleetmap.sensors.source_settings import Topics as Topics
 
 
 @dataclass(frozen=True, slots=True)
