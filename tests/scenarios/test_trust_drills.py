@@ -6,14 +6,13 @@ Each drill shows first what the thief achieves, or tries, and then the way back.
 import getpass
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
-from typer.testing import CliRunner
 
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
@@ -28,6 +27,7 @@ from mapserver.trust import KeyFolder, SignedLists
 from mapserver.trust.repository import ListRepository, site_targets
 from mapserver.trust.signing import init_offline
 from support.fleet.dashboard_scene import serving
+from support.room_site import invoke
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 SITE, YEAR_NS = "lab", 365 * 86_400_000_000_000
@@ -45,7 +45,7 @@ class Drill:
 
     def run(self, *words: object, fails: str = "") -> str:
         """`mapserver trust` with these words."""
-        result = CliRunner().invoke(cli.app, ["trust", *map(str, words), "--store", str(self.store)], obj=None)
+        result = invoke(cli.app, "trust", *words, "--store", self.store)
         if fails:
             assert isinstance(result.exception, FleetmapError), result.output
             assert fails in str(result.exception)
@@ -62,26 +62,20 @@ class Drill:
     def robot(self, name: str) -> "Robot":
         return Robot(self, self.robots.enter_context(Bus(self.endpoint).open()), name)
 
-    def repository(self) -> ListRepository:
-        return ListRepository(self.store, datetime.now(UTC))
-
     def publish(self, seed: int) -> None:
         with MapStore.open(self.store) as store:
             save_sample_draft(store, seed=seed)
             releases.publish(store, SITE)
 
-    def by_thief(self, act: Callable[[ListRepository], None]) -> Callable[[], None]:
-        """Lets a thief write into the server's folder of lists; the result puts it back as it was."""
+    @contextmanager
+    def thief(self) -> Iterator[ListRepository]:
+        """The server's folder of lists as a thief may write into it; at the end it is as it was."""
         before = self.folder / "before"
-        shutil.rmtree(before, ignore_errors=True)
         shutil.copytree(self.lists.folder, before)
-        act(self.repository())
-
-        def restore() -> None:  # the server is at work in the folder: nothing is deleted under it
-            self.lists.folder.rename(self.folder / f"stolen-{before.stat().st_ino}")
-            before.rename(self.lists.folder)
-
-        return restore
+        yield ListRepository(self.store, datetime.now(UTC))
+        # The server is at work in the folder: nothing is deleted under it.
+        self.lists.folder.rename(self.folder / "stolen")
+        before.rename(self.lists.folder)
 
 
 class Robot:
@@ -137,14 +131,10 @@ def sign_online(repository: ListRepository, drill: Drill, number: int, site_list
 def test_the_online_key_is_stolen(drill: Drill) -> None:
     robot = drill.robot("r1")
     assert robot.ready() == (2, "")
-
-    def forge(repository: ListRepository) -> None:
+    with drill.thief() as repository:
         sign_online(repository, drill, 100, drill.lists.newest("site-lab"))
-
-    restore = drill.by_thief(forge)
-    assert robot.ready() == (2, "")
-    assert not robot.takes(99, FORGED)
-    restore()
+        assert robot.ready() == (2, "")
+        assert not robot.takes(99, FORGED)
     drill.publish(seed=2)
     version, note = robot.ready()
     assert version == 2  # it believed the thief's numbers, and refuses the honest server for it
@@ -158,16 +148,12 @@ def test_the_sites_key_is_stolen(drill: Drill) -> None:
     robot = drill.robot("r1")
     assert robot.ready() == (2, "")
     number = 2**31 - 1
-
-    def forge(repository: ListRepository) -> None:
+    with drill.thief() as repository:
         about = VersionState(version=99, state="current", vocabulary="0" * 64)
         key = KeyFolder(drill.store / "keys").signer(f"site-{SITE}")
         repository._sign(f"site-{SITE}", site_targets(SITE, [AdmittedVersion(FORGED, 500, about)], number), key)
         sign_online(repository, drill, 50, number)
-
-    restore = drill.by_thief(forge)
-    assert robot.takes(99, FORGED)  # nothing stops a thief of both: the control
-    restore()
+        assert robot.takes(99, FORGED)  # nothing stops a thief of both: the control
     drill.publish(seed=2)
     assert "rollback: " in robot.ready()[1]
     drill.run("admit", SITE, *drill.key)
@@ -212,9 +198,9 @@ def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         version, note = robot.ready()
         assert version == 2
         assert "version 2 stays active: freeze: " in note
-        result = CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)])
+        result = invoke(cli.app, "trust", "status", "--store", drill.store)
         assert result.exit_code == 1
         assert "root: expired: robots refuse new maps" in result.output
         drill.run("rotate", "root", *drill.key)
         assert robot.ready() == (3, "")
-        assert CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)]).exit_code == 0
+        drill.run("status")

@@ -95,9 +95,7 @@ def told_s(
 @pytest.mark.parametrize("rate_hz", [5.0, 15.0, 30.0])
 @pytest.mark.parametrize("way", [after(lift), after(lambda t: posed(0.5 * t, 0.4 * t, y_m=0.4 * t)), after(tip)])
 def test_a_robot_that_leaves_its_floor_is_told_at_once(way: Way, rate_hz: float) -> None:
-    told = told_s(way, rate_hz)
-    assert told
-    assert 0.0 < told[0] < 0.41 + 1.0 / rate_hz
+    assert 0.0 < told_s(way, rate_hz)[0] < 0.41 + 1.0 / rate_hz
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 15.0, 30.0])

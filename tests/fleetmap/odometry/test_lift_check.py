@@ -55,9 +55,8 @@ def test_what_is_a_lift(way: Callable[[float], Pose], stops_s: float, within_s: 
     for k in range(1, round(5.0 / FRAME_S)):
         x_m, z_m, pitch_rad = way(k * FRAME_S)
         odom_from_body: Array = se3(so3_exp(np.array([0.0, pitch_rad, 0.0])), np.array([x_m, 0.0, z_m])) @ MOUNTED
-        speed_mps = np.array([1.0 if k * FRAME_S < stops_s else 0.0, 0.0, 0.0])
         stamp_ns = int(k * FRAME_S * 1e9)
-        wheel = [WheelSample(stamp_ns, speed_mps, 0.0, 0.02, 0.02)] if has_wheels else []
+        wheel = [_rolling(stamp_ns, 1.0 if k * FRAME_S < stops_s else 0.0)] if has_wheels else []
         if check.is_lifted(stamp_ns, wheel, odom_from_body, se3_inverse(before) @ odom_from_body, 0.01):
             told_s.append(k * FRAME_S)
         before = odom_from_body
@@ -68,8 +67,7 @@ def test_what_is_a_lift(way: Callable[[float], Pose], stops_s: float, within_s: 
 def test_wheels_that_never_turn_say_nothing() -> None:
     check, step = LiftCheck(np.eye(4)), se3(np.eye(3), np.array([0.05, 0.0, 0.0]))
     for k in range(30):
-        wheel = [WheelSample(k * 66_000_000, np.zeros(3), 0.0, 0.02, 0.02)]
-        assert not check.is_lifted(k * 66_000_000, wheel, np.eye(4), step, 0.01)
+        assert not check.is_lifted(k * 66_000_000, [_rolling(k * 66_000_000, 0.0)], np.eye(4), step, 0.01)
 
 
 def test_a_turn_on_the_spot_is_no_lift_and_a_robot_set_down_on_a_slope_is_told_once() -> None:
@@ -81,9 +79,8 @@ def test_a_turn_on_the_spot_is_no_lift_and_a_robot_set_down_on_a_slope_is_told_o
         yaw_rad, pitch_rad = 2.0 * np.clip(t - 2.0, 0, 3), np.radians(15.0) * np.clip(t - 8.0, 0, 0.5) / 0.5
         axle = se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([min(t, 2.0), 0.0, 0.0]))
         now: Array = axle @ axle_from_base @ se3(so3_exp(np.array([0.0, pitch_rad, 0.0])), np.zeros(3))
-        speed_mps, stamp_ns = np.array([1.0 if t < 2.0 else 0.0, 0.0, 0.0]), int(t * 1e9)
-        wheel = [WheelSample(stamp_ns, speed_mps, 2.0 if 2.0 < t < 5.0 else 0.0, 0.02, 0.02)]
-        if check.is_lifted(stamp_ns, wheel, now, se3_inverse(before) @ now, 0.01):
+        wheel = [_rolling(int(t * 1e9), 1.0 if t < 2.0 else 0.0, 2.0 if 2.0 < t < 5.0 else 0.0)]
+        if check.is_lifted(int(t * 1e9), wheel, now, se3_inverse(before) @ now, 0.01):
             told_s.append(t)
         before = now
     assert len(told_s) == 1
@@ -101,5 +98,5 @@ def test_wheels_that_turned_while_frames_were_missing_have_turned() -> None:
     assert not check.is_lifted(begin_ns + 300_000_000, wheel, slope @ step, step, 0.001)
 
 
-def _rolling(stamp_ns: int, speed_mps: float) -> WheelSample:
-    return WheelSample(stamp_ns, np.array([speed_mps, 0.0, 0.0]), 0.0, 0.02, 0.02)
+def _rolling(stamp_ns: int, speed_mps: float, yaw_rate_radps: float = 0.0) -> WheelSample:
+    return WheelSample(stamp_ns, np.array([speed_mps, 0.0, 0.0]), yaw_rate_radps, 0.02, 0.02)

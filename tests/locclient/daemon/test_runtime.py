@@ -276,9 +276,8 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
         current = robot_world.wanted(world.store)
         with MemoryBus(world.hub) as server:
             server.publish(robot_key("room", "r1", "wanted"), encode_message(current))
-        assert eventually(lambda: len(robot.versions.held) == 2, 20), (
-            "taken by the thread that localizes, between frames"
-        )
+        # Taken by the thread that localizes, between frames.
+        assert eventually(lambda: len(robot.versions.held) == 2, 20)
 
     source.before[70] = publish
     estimates = started(parts)

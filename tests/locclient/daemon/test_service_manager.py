@@ -10,6 +10,8 @@ import pytest
 from locclient.daemon.service_manager import ServiceManager
 from support.command_line import status
 
+Said = pytest.CaptureFixture[str]
+
 
 @pytest.mark.parametrize("abstract", [False, True])
 def test_the_manager_is_told(tmp_path: Path, abstract: bool) -> None:
@@ -46,9 +48,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> int:
     return status("locclient", "status")
 
 
-def test_what_the_daemon_says_can_be_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_the_daemon_says_can_be_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
     assert asked(monkeypatch, tmp_path) == 3
     assert re.search(r"no daemon has written .*; start `locclient run`", capsys.readouterr().err)
     manager = ServiceManager()
@@ -78,12 +78,7 @@ def test_a_status_can_be_read_at_once(tmp_path: Path, monkeypatch: pytest.Monkey
     ],
 )
 def test_an_old_or_broken_status_is_none(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    later_s: float,
-    text: str,
-    words: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said, later_s: float, text: str, words: str
 ) -> None:
     now_s = time.monotonic()
     content = text.format(now=now_s).encode("utf-8", "surrogateescape")

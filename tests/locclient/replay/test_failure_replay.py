@@ -172,9 +172,8 @@ def test_a_robot_that_saw_the_map_behind_it_or_beside_a_mask_is_replayed_as_well
     with MapStore.open(robot_world.stored(tmp_path / "store")) as store:
         report, data, said = failed(ride, robot_world.loaded(store), "full", whole)
     assert (report.cause, report.view) == ("carried", 1 if rig == "rear" else None)
-    np.testing.assert_allclose(
-        report.camera.base_from_cam.target_from_source, known.cameras[0].body_from_cam, atol=0.02
-    )
+    base_from_cam = report.camera.base_from_cam.target_from_source
+    np.testing.assert_allclose(base_from_cam, known.cameras[0].body_from_cam, atol=0.02)
     shown = [cv2.imdecode(np.frombuffer(each.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE) for each in report.thumbnails]
     assert min(picture.std() for picture in shown) > 20, "none is black"
     (tmp_path / "failure.mcap").write_bytes(data)

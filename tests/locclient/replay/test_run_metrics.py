@@ -1,13 +1,12 @@
 """What a run was worth, against sequences small enough to judge by hand, and its picture, with colours that say what happened."""
 
-from collections.abc import Iterable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_exp
+from fleetmap.geometry import Array, se3, se3_exp
 from fleetmap.messages import Status
 from locclient.replay import run_metrics
 from locclient.replay.plots import RunPlot, draw_protection, draw_run, ticks
@@ -44,10 +43,9 @@ WRONG: dict[str, object] = {"error_m": 0.31, "sigma_m": 0.5}  # honest about its
 LOST: dict[str, object] = {"status": L, "fix": False, "error_m": None, "sigma_m": None}
 
 
-def counts(frames: Iterable[FrameRecord]) -> tuple[object, object]:
+def counts(frames: list[FrameRecord]) -> tuple[object, object]:
     """(silent, position) failures."""
-    listed = list(frames)
-    return METRICS["silent_failures"](listed), METRICS["position_failures"](listed)
+    return METRICS["silent_failures"](frames), METRICS["position_failures"](frames)
 
 
 def test_errors_are_compared_with_their_levels() -> None:
@@ -192,8 +190,7 @@ def test_the_share_that_leads_is_of_all_frames(share: float) -> None:
     frames += [frame(0.1 * k) for k in range(1000 - found, 1000)]
     assert METRICS["localised_share_of_all"](frames) == pytest.approx(share)
     assert METRICS["localised_share"](frames) == (1.0 if found else None)
-    assert next(iter(METRICS)) == "frames"
-    assert list(METRICS)[1] == "localised_share_of_all"
+    assert list(METRICS)[:2] == ["frames", "localised_share_of_all"]
 
 
 def test_time_not_localised_is_a_share_of_the_driving() -> None:
@@ -204,14 +201,14 @@ def test_time_not_localised_is_a_share_of_the_driving() -> None:
 
 def test_between_sparse_frames_nothing_better_is_known() -> None:
     """2.5 s apart: one lost frame is 2.5 s without a place, one wrong fix 2.5 s in the wrong place."""
-    kinds: list[dict[str, object]] = [{"status": L}, {"status": L}, LOST, {"status": L}, {"status": L}]
-    frames = [frame(2.5 * k, **kind) for k, kind in enumerate(kinds)]  # type: ignore[arg-type]
+    frames = [frame(2.5 * k, L) for k in range(5)]
+    frames[2] = frame(5.0, **LOST)
     assert METRICS["localised_share"](frames) == pytest.approx(0.8)
     assert counts(frames) == (0, 1)
-    kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.5}
-    assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (0, 1), "whoever is lost claims nothing"  # type: ignore[arg-type]
-    kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.1}
-    assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (1, 1)  # type: ignore[arg-type]
+    frames[2] = frame(5.0, L, error_m=0.4, sigma_m=0.5)
+    assert counts(frames) == (0, 1), "whoever is lost claims nothing"
+    frames[2] = frame(5.0, L, error_m=0.4, sigma_m=0.1)
+    assert counts(frames) == (1, 1)
 
 
 def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: float = 1.0) -> ReplayResult:
@@ -220,13 +217,10 @@ def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: floa
     truth_from_map = se3_exp(np.array([0.3, -2.0, 1.0, 40.0, -7.0, 3.0]))
     estimates = []
     for number, place in enumerate(places):
-        map_from_body = np.eye(4)
-        map_from_body[:3, 3] = place / scale + [0.0, 0.0, 0.01 * (-1) ** number]
-        estimates.append(SimpleNamespace(map_from_body=map_from_body))
+        off_m = [0.0, 0.0, 0.01 * (-1) ** number]
+        estimates.append(SimpleNamespace(map_from_body=se3(np.eye(3), place / scale + off_m)))
         if truths[number] is not None:
-            truths[number] = truth_from_map @ np.block(
-                [[np.eye(3), place[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]
-            )
+            truths[number] = truth_from_map @ se3(np.eye(3), place)
     return ReplayResult(frames, estimates, truths, None, truth_in_map=False)  # type: ignore[arg-type]
 
 
@@ -258,17 +252,15 @@ FRAMES = 60
 RED, VIOLET = (47, 52, 209), (168, 60, 190)
 
 
-def plot(**about: object) -> RunPlot:
+def plot() -> RunPlot:
     """Ten metres in six seconds past two walls, 10 mm off."""
     x = np.linspace(0.0, 10.0, FRAMES)
     truths = np.column_stack([x, 0 * x, 0 * x])
     error = np.array([0.0, 0.01, 0.0])
-    frames = [
-        FrameRecord(k * 10**8, Status.TRACKING, True, 1e-4 * np.eye(6), error, 0.01, 0.005, 0.006, {})
-        for k in range(FRAMES)
-    ]
+    about = Status.TRACKING, True, 1e-4 * np.eye(6), error, 0.01, 0.005, 0.006, {}
+    frames = [FrameRecord(k * 10**8, *about) for k in range(FRAMES)]
     walls = np.column_stack([np.tile(x, 2), np.repeat([-2.0, 2.0], FRAMES), np.ones(2 * FRAMES)])
-    return RunPlot("hall, version 3", frames, truths + error, truths, walls)._replace(**about)
+    return RunPlot("hall, version 3", frames, truths + error, truths, walls)
 
 
 def count(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> int:
@@ -300,14 +292,10 @@ def test_large_errors_and_frames_that_are_not_localised_stand_out() -> None:
 @pytest.mark.parametrize("landmarks", [0, 1, 2 * FRAMES])
 def test_runs_without_truth_or_pose_are_drawn(frames: int, landmarks: int) -> None:
     run, nowhere = plot(), np.full((frames, 3), np.nan)
-    lost = [
-        frame._replace(status=Status.LOST, has_fix=False, cov_rot_trans=None, error_map_m=None, error_rad=None)
-        for frame in run.frames[:frames]
-    ]
-    assert draw_run(RunPlot("x", lost, nowhere, nowhere, run.landmarks_map_m[:landmarks])).shape[1] == 2040
     untold = [frame._replace(error_map_m=None, error_rad=None) for frame in run.frames[:frames]]
-    shown = RunPlot("x", untold, run.positions_map_m[:frames], nowhere, run.landmarks_map_m[:landmarks])
-    assert draw_run(shown).shape[1] == 2040
+    lost = [frame._replace(status=Status.LOST, has_fix=False, cov_rot_trans=None) for frame in untold]
+    for shown, places in ((lost, nowhere), (untold, run.positions_map_m[:frames])):
+        assert draw_run(RunPlot("x", shown, places, nowhere, run.landmarks_map_m[:landmarks])).shape[1] == 2040
 
 
 def test_ticks_are_round() -> None:

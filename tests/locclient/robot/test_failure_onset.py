@@ -54,9 +54,8 @@ def test_pictures_are_from_two_seconds_and_half_a_second_before_and_the_beginnin
     assert onset.left[0, 0] == 60
     early = OnsetRecorder()
     played(early, (estimate(0.1 * n) for n in range(20)), begun_s=0.0)
-    assert [int(picture[0, 0]) for _, picture in early.onset(BLIND, 0, left(19)).pictures] == [0], (
-        "there was none before"
-    )
+    pictures = early.onset(BLIND, 0, left(19)).pictures
+    assert [int(picture[0, 0]) for _, picture in pictures] == [0], "there was none before"
 
 
 def test_pictures_cost_little_memory() -> None:

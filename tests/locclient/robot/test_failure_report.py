@@ -44,10 +44,9 @@ def is_like(jpeg: bytes, left: np.ndarray, other: np.ndarray) -> bool:
     """Whether the picture under what is drawn over a match view is rather `left` than `other`."""
     view = grey(jpeg)
     under = view[-(view.shape[1] // 2) * left.shape[0] // left.shape[1] :, : view.shape[1] // 2]
-    far = [
-        np.median(np.abs(under - cv2.resize(np.asarray(each, np.float64), under.shape[::-1]))) for each in (left, other)
-    ]
-    return bool(far[0] < far[1])
+    shown = (cv2.resize(np.asarray(each, np.float64), under.shape[::-1]) for each in (left, other))
+    to_left, to_other = (np.median(np.abs(under - each)) for each in shown)
+    return bool(to_left < to_other)
 
 
 def test_the_match_view_tells_the_right_place_from_a_wrong_one() -> None:

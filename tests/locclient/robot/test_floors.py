@@ -94,7 +94,6 @@ def test_a_robot_that_visits_a_floor_reports_no_pose_on_its_own(tmp_path: Path) 
         outcomes = [robot.handle(bundle) for bundle in robot_world.bundles(50)]
     last = outcomes[-1]
     assert last.published.level == "L1"
-    np.testing.assert_allclose(
-        last.published.map_from_base, last.estimate.map_from_body @ se3_inverse(robot.base_from_body), atol=1e-9
-    )
+    on_its_floor = last.estimate.map_from_body @ se3_inverse(robot.base_from_body)
+    np.testing.assert_allclose(last.published.map_from_base, on_its_floor, atol=1e-9)
     assert last.pose_message() is None

@@ -176,9 +176,8 @@ def driven(store: MapStore, *, views: int = 1, imu: float | None = 1, wheels: fl
     """Two laps of a robot in its map. imu, wheels: -1 for samples as of a body that looks back, None without them. views: 2 for a rig whose
     second pair looks back and shows nothing."""
     rig = calibration(has_imu=imu is not None)
-    robot = robot_world.new_robot(
-        store, replace(rig, cameras=(rig.cameras + robot_world.turned(rig.cameras))[: 2 * views])
-    )
+    cameras = rig.cameras + robot_world.turned(rig.cameras)
+    robot = robot_world.new_robot(store, replace(rig, cameras=cameras[: 2 * views]))
     outcomes, turn = [], np.array([imu or 1, imu or 1, 1])
     for number, bundle in enumerate(robot_world.bundles(FRAMES)):
         samples = ImuSamples(bundle.imu.stamps_ns, bundle.imu.gyro_radps * turn, bundle.imu.accel_mps2 * turn)

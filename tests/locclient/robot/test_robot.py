@@ -146,9 +146,8 @@ def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(store: MapStore) -> No
     assert agreed > robot_world.SETTINGS.track.confirming_fixes, "one search does not move it"
     passed = np.array([robot_world.truth(number)[:3, 3] for number in range(GIVEN, back + 1)])
     travelled_m = np.linalg.norm(np.diff(passed, axis=0), axis=1).sum()
-    assert travelled_m > 0.9 * robot_world.SETTINGS.track.confirming_distance_m, (
-        "by its odometry, whose noise adds some"
-    )
+    # By its odometry, whose noise adds some.
+    assert travelled_m > 0.9 * robot_world.SETTINGS.track.confirming_distance_m
     assert all(one.status is not Status.TRACKING or off_m(one, n) < 0.3 for n, one in enumerate(estimates))
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
 from fleetmap.plugins.viewer_channels.channels import CHANNELS
 from locclient.cli import app
+from support.room_site import run
 from support.worlds import robot_world
 
 FRAMES, CARRIED_AT = 110, 75
@@ -43,9 +43,7 @@ def map_from_base(message: Any) -> Array | None:
 
 def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    given = ["replay", room[1], "--site", "room", "--store", room[0], "--robot", "r1", "--mcap", path]
-    done = CliRunner().invoke(app, [str(word) for word in given])
-    assert done.exit_code == 0, done.output
+    run(app, "replay", room[1], "--site", "room", "--store", room[0], "--robot", "r1", "--mcap", path)
     seen: dict[str, dict[int, Any]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -72,14 +70,13 @@ def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [(["--mcap", "run.txt"], "must end in .mcap"), (["--mcap", "run.mcap"], "pip install '.[foxglove]'")],
+    [(["--mcap", "run.txt"], r"must end in \.mcap"), (["--mcap", "run.mcap"], r"pip install '\.\[foxglove\]'")],
 )
 def test_wrong_orders_are_told_before_the_work(
     room: tuple[Path, Path], given: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    done = CliRunner().invoke(app, ["replay", str(room[1]), "--site", "room", "--store", str(room[0]), *given])
-    assert isinstance(done.exception, UsageError)
-    assert said in str(done.exception)
+    with pytest.raises(UsageError, match=said):
+        run(app, "replay", room[1], "--site", "room", "--store", room[0], *given)
     assert not list(tmp_path.iterdir())
