@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, Mask, se3, se3_inverse, skew, so3_exp, so3_log
+from fleetmap.geometry import Array, Mask, se3, se3_inverse, skew, so3_exp, so3_log, turned_cov
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.calibration import CalibrationParameter as P
@@ -104,8 +104,7 @@ def check_mountings(recording: Recording, on_frame: Callable[[], None] = lambda:
             first = first if number else motion
             motions[number] += [] if motion is None or first is None else [(first, motion)]
             error = motion_between(pair[0], pair[1], rig[0])[1] if count % _EVERY == 0 else None
-            axes = np.kron(np.eye(2), rig[1][:3, :3])
-            scenes[number] += [] if error is None else [(axes @ error[0] @ axes.T, error[1])]
+            scenes[number] += [] if error is None else [(turned_cov(error[0], rig[1][:3, :3]), error[1])]
     return [
         judge_mounting(
             f"{name} against {names[0]}", mounting_error(seen, _repeated(seen, [*scenes[0], *own], recording))

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, Mask, rotation_between_vectors, se3, se3_inverse, so3_log, transport_cov
+from fleetmap import geometry
+from fleetmap.geometry import Array, Mask, se3, se3_inverse, so3_log, transport_cov, turned_cov
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.odometry.mono.mono_modes import make_odometry
@@ -181,7 +182,7 @@ def _levelled_by_imu(given: Trajectory, inputs: SurveyInputs) -> Array:
         return given.frame_from_body
     nearest = np.clip(np.searchsorted(given.stamps_ns, imu.stamps_ns), 0, len(given) - 1)
     up = np.einsum("nij,nj->i", given.frame_from_body[nearest, :3, :3], imu.accel_mps2) / len(imu)
-    level = se3(rotation_between_vectors(up, np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    level = se3(geometry.rotation_between_vectors(up, np.array([0.0, 0.0, 1.0])), np.zeros(3))
     return np.asarray(level @ given.frame_from_body)
 
 
@@ -270,8 +271,7 @@ class FrameChain:
         much. Across a restart, where that is zero, the previous one continues; a restart that loses gravity adds a wide one, since the
         estimate before it is barely reliable. After a pause without motion in the images a robot may be anywhere.
         """
-        turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3])
-        own_before, self._own = self._own, turn @ estimate.cov_rot_trans @ turn.T
+        own_before, self._own = self._own, turned_cov(estimate.cov_rot_trans, self._frame.frame_from_odom[:3, :3])
         if not self.estimates:
             return self._own
         first, last = self._frame_from_body[-2:]
@@ -287,8 +287,7 @@ class FrameChain:
             values, vectors = np.linalg.eigh(transport_cov(self._own, -lever_m) - own_before)
             gained = (vectors * np.abs(values)) @ vectors.T
         else:
-            carry = np.kron(np.eye(2), first[:3, :3])
-            gained = carry @ step_covariance @ carry.T
+            gained = turned_cov(step_covariance, first[:3, :3])
         return transport_cov(reached + gained, lever_m)
 
     @property
@@ -302,8 +301,7 @@ class FrameChain:
 
     def covariances(self) -> Array:
         """(F, 6, 6) in the axes of `odom_from_body`."""
-        turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3].T)
-        return np.asarray(turn @ np.array(self._covariances).reshape(-1, 6, 6) @ turn.T)
+        return turned_cov(np.array(self._covariances).reshape(-1, 6, 6), self.level_from_frame)
 
 
 def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
@@ -348,6 +346,5 @@ def _levelled(odom_from_body: Array, covariances: Array, body_from_cam: Array, c
     down = (odom_from_body[chosen, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
     if np.linalg.norm(down) < 1e-6:
         return odom_from_body, covariances
-    level_from_odom = se3(rotation_between_vectors(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
-    turn = np.kron(np.eye(2), level_from_odom[:3, :3])
-    return level_from_odom @ odom_from_body, turn @ covariances @ turn.T
+    level_from_odom = se3(geometry.rotation_between_vectors(down, np.array([0.0, 0.0, -1.0])), np.zeros(3))
+    return level_from_odom @ odom_from_body, turned_cov(covariances, level_from_odom[:3, :3])

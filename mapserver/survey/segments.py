@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov, turned_cov
 from fleetmap.sensors.samples import ImuSamples, Stamps, wheel_between
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
@@ -233,8 +233,8 @@ def _refusal(before: SegmentSurvey | str, after: SegmentSurvey | str) -> str | N
     a, b = before.odometry.odom_from_body[led]
     off = se3_inverse(se3_inverse(a) @ b) @ after.led
     error = np.concatenate([so3_log(off[:3, :3]), off[:3, 3]])
-    carry = np.kron(np.eye(2), after.led[:3, :3])  # covariances are in the axes of the first body
-    covariance = carry.T @ (edge_covariance(before.odometry, led[0], led[1]) + after.led_covariance) @ carry
+    covariance = edge_covariance(before.odometry, led[0], led[1]) + after.led_covariance
+    covariance = turned_cov(covariance, after.led[:3, :3].T)  # they are in the axes of the first body
     if float(error @ np.linalg.solve(covariance, error)) > _GATE:
         metres, degrees = np.linalg.norm(error[3:]), np.degrees(np.linalg.norm(error[:3]))
         return (
@@ -307,10 +307,10 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
     covariances, reached = list[Array](), placed[0].made.odometry.covariances[0]
     starts, ids, pixels, size = [np.zeros(1, np.int64)], [], [], 0
     for each in placed:
-        odometry, turn = each.made.odometry, np.kron(np.eye(2), each.joined_from_odom[:3, :3])
-        gained = reached - turn @ odometry.covariances[0] @ turn.T
-        levers_m = (odometry.odom_from_body[:, :3, 3] - odometry.odom_from_body[0, :3, 3]) @ turn[:3, :3].T
-        own = turn @ odometry.covariances @ turn.T
+        odometry, turn = each.made.odometry, each.joined_from_odom[:3, :3]
+        own = turned_cov(odometry.covariances, turn)
+        gained = reached - own[0]
+        levers_m = (odometry.odom_from_body[:, :3, 3] - odometry.odom_from_body[0, :3, 3]) @ turn.T
         covariances.append(own + np.array([transport_cov(gained, lever_m) for lever_m in levers_m]))
         reached = covariances[-1][-1]
         tracks = odometry.tracks

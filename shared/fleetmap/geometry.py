@@ -120,6 +120,12 @@ def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
     return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
 
 
+def turned_cov(cov_rot_trans: Array, rotation: Array) -> Array:
+    """Covariances (..., 6, 6) in axes turned by a rotation (3, 3)."""
+    turn = turn_both(rotation)
+    return np.asarray(turn @ cov_rot_trans @ turn.T)
+
+
 def turn_both(rotation: Array) -> Array:
     """(6, 6) matrix that turns both halves of a tangent vector by a rotation (3, 3)."""
     turn = np.zeros((6, 6))

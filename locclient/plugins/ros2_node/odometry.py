@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov, turned_cov
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings.ros2.messages import HALVES_SWAPPED, FrameLink, decode_frame_links
 from locclient.localization.estimate import Estimate
@@ -37,9 +37,8 @@ def motion_between(before: Localized, after: Localized, base_from_body: Array) -
     twist_cov = step_cov(sigmas, float(np.linalg.norm(step[:3, 3])))[HALVES_SWAPPED] / seconds**2
     # The odometry's frame may be rotated against the published one.
     published_from_odometry = (now.odom_from_base @ base_from_body)[:3, :3] @ odometry.odom_from_body[:3, :3].T
-    both = np.kron(np.eye(2), published_from_odometry)
     lever_m = now.odom_from_base[:3, :3] @ base_from_body[:3, 3]
-    covariance = transport_cov(both @ odometry.cov_rot_trans @ both.T, -lever_m)
+    covariance = transport_cov(turned_cov(odometry.cov_rot_trans, published_from_odometry), -lever_m)
     return now.odom_from_base, covariance[HALVES_SWAPPED], twist, twist_cov
 
 

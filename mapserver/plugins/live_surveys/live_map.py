@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, Indices, Mask, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
+from fleetmap import geometry
+from fleetmap.geometry import Array, Indices, Mask, se3, se3_adjoint, se3_inverse, transport_cov, turned_cov
 from fleetmap.messages import Cause, EstimateMessage, Placement, Status, covariance_entries
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.plugins.live_surveys import message
@@ -166,12 +167,10 @@ class LiveMap:
             status = (Status.TRACKING, Cause.NONE) if is_sure else (Status.DEGRADED, Cause.ODOMETRY)
             kept = next(n for n, each in enumerate(spans) if each.is_map)
             first, placed = int(np.flatnonzero(labels == kept)[0]), self.map_from_body[newest]
-            cov, lever = np.zeros((6, 6)), np.eye(6)
+            cov = np.zeros((6, 6))
             if self._marginals is not None and first != newest:
-                turn = np.kron(np.eye(2), placed[:3, :3])
-                cov = np.asarray(turn @ self._marginals.relative_cov(newest, first) @ turn.T)
-            lever[3:, :3] = -skew(placed[:3, :3] @ body_from_base[:3, 3])
-            cov = lever @ cov @ lever.T
+                cov = turned_cov(self._marginals.relative_cov(newest, first), placed[:3, :3])
+            cov = transport_cov(cov, placed[:3, :3] @ body_from_base[:3, 3])
         return EstimateMessage(
             stamp_ns=self._keyframes[newest].stamp_ns,
             status=status[0].value,
@@ -225,7 +224,7 @@ class LiveMap:
         """Return (3, 3) rotation of the chain that makes the newest keyframe upright by odometry: windows have rotated the chain."""
         new, up = self._news[-1], np.array([0.0, 0.0, 1.0])
         up_body = (new.level_from_frame @ new.frame_from_body[:3, :3]).T @ up
-        return rotation_between_vectors(self._chain_from_body[-1][:3, :3] @ up_body, up)
+        return geometry.rotation_between_vectors(self._chain_from_body[-1][:3, :3] @ up_body, up)
 
     def _matched(self, first: int) -> list[PairMatch]:
         """Match the newest keyframe with those of the window that see the same."""

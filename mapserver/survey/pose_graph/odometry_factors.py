@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transport_cov
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transport_cov, turned_cov
 from fleetmap.odometry.sensor_buffer import is_pause
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import MIN_SEEN
@@ -89,5 +89,4 @@ def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_fr
     gained = transport_cov(known[1], -odom_from_first @ first_from_last[:3, 3]) - known[0]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
     gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames may have moved since
-    carry = np.kron(np.eye(2), odom_from_first.T)
-    return np.asarray(carry @ gained @ carry.T + least.covariance(first_from_last))
+    return turned_cov(gained, odom_from_first.T) + least.covariance(first_from_last)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, transport_cov
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, transport_cov, turned_cov
 from fleetmap.sensors.samples import PositionPrior
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.odometry_factors import edge_covariance
@@ -115,8 +115,8 @@ def level_fit(there: Array, here: Array) -> Array:
 
 def in_frame(term: PriorTerm, new_from_map: Array) -> PriorTerm:
     """Return a prior in another frame; new_from_map (4, 4)."""
-    turn = np.kron(np.eye(2), new_from_map[:3, :3])
-    return replace(term, map_from_body=new_from_map @ term.map_from_body, information=turn @ term.information @ turn.T)
+    information = turned_cov(term.information, new_from_map[:3, :3])
+    return replace(term, map_from_body=new_from_map @ term.map_from_body, information=information)
 
 
 def judged_priors(priors: Sequence[PriorTerm], map_from_body: Array) -> tuple[list[PriorTerm], bool]:
@@ -163,8 +163,7 @@ def _terms(
         covariance = transport_cov(_finite(prior) + _UNEVEN, map_from_k[:3, 3] - map_from_base[:3, 3])
         if frames[k] != frame:
             first, last = sorted((frame, int(frames[k])))
-            turned = np.kron(np.eye(2), map_from_k[:3, :3])
-            covariance = covariance + turned @ edge_covariance(odometry, first, last) @ turned.T
+            covariance = covariance + turned_cov(edge_covariance(odometry, first, last), map_from_k[:3, :3])
         found.append(PriorTerm(k, map_from_k, np.asarray(np.linalg.inv(covariance), np.float64)))
     return found
 
@@ -224,10 +223,10 @@ def _agree(marginals: GraphMarginals, reference: PriorTerm, term: PriorTerm) -> 
 def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:
     """Return the pose of a term's keyframe relative to the reference's."""
     apart_m = term.map_from_body[:3, 3] - reference.map_from_body[:3, 3]
-    i_from_map = np.kron(np.eye(2), reference.map_from_body[:3, :3].T)
     both = _covariance(reference) + transport_cov(_covariance(term), -apart_m)
     i_from_j = se3_inverse(reference.map_from_body) @ term.map_from_body
-    return PoseEdge(reference.k, term.k, i_from_j, i_from_map @ both @ i_from_map.T, is_loop=True)
+    cov_in_i = turned_cov(both, reference.map_from_body[:3, :3].T)
+    return PoseEdge(reference.k, term.k, i_from_j, cov_in_i, is_loop=True)
 
 
 def _finite(prior: PositionPrior) -> Array:
