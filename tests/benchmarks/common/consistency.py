@@ -1,6 +1,7 @@
 """Monte-Carlo runs of the odometry: how large its errors are beside what its covariance says of them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,7 @@ _SIDEWAYS_M = 0.15  # by which a run's way points are shifted at random
 _COLUMNS = "stamps_ns", "gyro_radps", "accel_mps2"
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
+class Figures(NamedTuple):
     """One run: mean normalised errors squared per degree of freedom, rms and final error, way."""
 
     rotation_nees: float

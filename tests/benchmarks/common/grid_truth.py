@@ -1,7 +1,7 @@
 """Where things stand in a simulated warehouse, as a planner's grid, and how near an estimated grid comes to it."""
 
 import heapq
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +69,7 @@ def in_hall(grid: OccupancyGrid, shape: tuple[int, ...]) -> NDArray[np.int8]:
     return cells
 
 
-@dataclass(frozen=True, slots=True)
-class GridFigures:
+class GridFigures(NamedTuple):
     """Of an estimated grid against the truth.
 
     occupied_near: share of occupied cells within one cell of the truth. free_wrong: share of free cells that are occupied in truth.

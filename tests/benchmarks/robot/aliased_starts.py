@@ -1,8 +1,9 @@
 """Starts anywhere in aisles that look the same, estimator level: what the localizer says before and after motion decides."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,8 +62,7 @@ class LateSession(EstimatorSession):
         return self._whole.features(frame + self._start)
 
 
-@dataclass(frozen=True, slots=True)
-class Site:
+class Site(NamedTuple):
     """A robot's drive, and the map of a survey. lookalikes: what its build would have measured, None where it did not."""
 
     robot: RememberingSession
@@ -95,8 +95,7 @@ def measured_lookalikes(view: MapView, survey: EstimatorSession) -> LookAlikes |
     return LookAlikes(starts.lookalike_recall, starts.max_wrong_share, float(starts.lookalike_inliers or 0))
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(NamedTuple):
     """How one start went.
 
     wrong_frames: TRACKING and more than WRONG_M off. ambiguous_frames, and of those with the right place among the hypotheses.

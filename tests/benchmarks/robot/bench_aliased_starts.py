@@ -8,8 +8,6 @@ it must not be misled by signs out of an aisle that is not in the map, nor where
 that is not in the map nothing protects.
 """
 
-from dataclasses import asdict
-
 import numpy as np
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
@@ -103,5 +101,5 @@ def main(arguments: Options) -> Results:
         for name, starts in found.items():
             starts.extend(starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(seeds)), seed))
     figures = {name: judged(name, starts) for name, starts in found.items()}
-    outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
+    outcomes = {name: [start._asdict() for start in starts] for name, starts in found.items()}
     return {"figures": figures, "starts": outcomes}

@@ -5,9 +5,9 @@ each, instead of spoiling its calibration; each start is told its place as by a 
 """
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,7 @@ _NAMES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """One fault. found_s: until the estimate says that the calibration is wrong, None for never; named: the parameters that have drifted
     then, the costliest first, with commas. tracking_max_m: the largest error of frames that were TRACKING. silent_max_m: the largest of
     those whose covariance holds nothing of the calibration, or is too small even so.
@@ -156,6 +155,6 @@ def main(options: Options) -> Results:
         for name, drive, chosen, watched_s in runs:
             found = outcome(name, watched(drive, store, chosen, watched_s))
             good = good or found
-            told.append(asdict(found) | {"is_right": found.is_right(good), "begin": int(chosen[0])})
+            told.append(found._asdict() | {"is_right": found.is_right(good), "begin": int(chosen[0])})
             print(json.dumps(told[-1]), flush=True)
     return {"good" if options.good else "faults": told}

@@ -4,7 +4,7 @@ Recordings and map are kept in the work folder, where bench_localization.py find
 of the fault's beginning is one of those that are promised, nothing fails silently, and the robot tracks again soon after the fault's end.
 """
 
-from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,8 +31,7 @@ EXPECTED: dict[str, tuple[set[Status], str]] = {
 WITHIN_S, RECOVERY_S, RECOVERY_M = 1.0, 5.0, 20.0
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How a fault went: seconds from its first frame until an expected status with the cause named, None for never; until tracking
     after its end, and the way driven meanwhile."""
 
@@ -102,4 +101,4 @@ def main(arguments: Options) -> Results:
     for name in arguments.only:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
         found.append(outcome(name, played(recording, store)))
-    return {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}}
+    return {"faults": {o.fault: o._asdict() | {"is_right": o.is_right} for o in found}}

@@ -5,10 +5,11 @@ their ends; without pictures, but for dropped frames: those are of a rendered dr
 of pictures. Half of these drop frames at random, half in bursts of up to a second.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,7 @@ _DROPPED = "of frames dropped"
 _SHARES, _SHORTEST_BURST, _LONGEST_BURST, _HEAD = (0.1, 0.3, 0.5, 0.7), 3, 16, 30
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Of one run: failures by `fleetmap.failure_definition`, the share of frames TRACKING, the cause `carried`, and seconds from the first
     pull to LOST, inf if it was never said."""
 
@@ -109,7 +109,7 @@ def _carried(seed: int, number: int) -> Outcome:
     heights_m = run.map_from_body[:, 2, 3]
     pulled = int(np.argmax(heights_m > heights_m[:_HEAD].max() + 0.005))
     said = [e.stamp_ns for e in estimates[pulled:] if e.status in (Status.LOST, Status.AMBIGUOUS)]
-    return replace(outcome, lost_s=(said[0] - run.stamps_ns[pulled]) * 1e-9 if said else inf)
+    return outcome._replace(lost_s=(said[0] - run.stamps_ns[pulled]) * 1e-9 if said else inf)
 
 
 def _dark(seed: int, number: int) -> Outcome:

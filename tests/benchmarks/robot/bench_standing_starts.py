@@ -6,7 +6,8 @@ is wrong.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -32,8 +33,7 @@ _FOLLOWED_S, _LIGHT, _DAY, _ROBOT = 2.0, "night", 3, "runner-1"
 PIPELINES = ("clean", "night-gain")
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(NamedTuple):
     """How one start went: seconds until the first right fix, and until TRACKING at the right place, None for never; whether it was ever
     TRACKING elsewhere."""
 

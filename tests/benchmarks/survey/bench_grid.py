@@ -5,7 +5,7 @@ dense stereo and the cells do, without a survey's error. Then those of another d
 for a robot of 0.3 m radius.
 """
 
-from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -42,8 +42,7 @@ def views_from_truth(session: Session, before: Tiles) -> SessionViews:
     return views
 
 
-@dataclass(frozen=True, slots=True)
-class Judged:
+class Judged(NamedTuple):
     """An estimated grid's figures; path: cells of a planned path, of which crossed are occupied in truth (rows, columns)."""
 
     figures: GridFigures
@@ -97,6 +96,6 @@ def main(options: Options) -> Results:
         grids = [occupancy(tiles, HEIGHT_M) for tiles in (first, second)]
         judged = [judge(grid, day) for grid, day in zip(grids, days, strict=True)]
         moved, left = judge_night(views, second, (judged[0].truth, judged[1].truth))
-        found = [asdict(one.figures) | {"path": one.path, "crossed": one.crossed} for one in judged]
+        found = [one.figures._asdict() | {"path": one.path, "crossed": one.crossed} for one in judged]
         halls[hall] = {"days": found, "moved": moved, "left": left}
     return halls

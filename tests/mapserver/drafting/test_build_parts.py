@@ -11,8 +11,8 @@ from rich.console import Console
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
-from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
+from mapserver.drafting.survey_recordings import read_zones
 from mapserver.evaluation.trajectory_error import accuracy
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey

@@ -1,9 +1,10 @@
 """Drives of one situation under one configuration: the localizer in the loop, judged by the definition of a failure."""
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from math import inf
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,8 +25,7 @@ _SILENT_S = 1.0
 _COUNTED_S = 3.0  # an event that begins later than so long before the end is not counted, nor a failure that it might have led to
 
 
-@dataclass(frozen=True, slots=True)
-class Configuration:
+class Configuration(NamedTuple):
     """The whole system but for what is taken away. day: nights since the survey on every trip, None for each trip's own."""
 
     settings: LocalizerSettings = WHOLE_SITE
@@ -50,8 +50,7 @@ CONFIGURATIONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(NamedTuple):
     """One drive's outcome. kinds: how many failures of each kind; one failure may be of two."""
 
     hours: float

@@ -1,7 +1,7 @@
 """A block of the fulfilment centre, the map of its survey, and trips of robots through it; all at the estimator's level."""
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ _REMEMBERED = 500  # stretches of half a metre: more than the longest drive has
 Point = tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Trip:
+class Trip(NamedTuple):
     """A robot's drive: its routes, one more for each time that it is carried, and what goes wrong on the way.
 
     name: of the way. Trips of one name share ripple, wear and noise, so that they differ in what goes wrong alone.

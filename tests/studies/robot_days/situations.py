@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Literal
@@ -53,7 +53,7 @@ class Situation:
             on_way, self.length_m, stop_s=float(on_way.uniform(3.0, 8.0)) if self.length_m >= _TRIP_M else 0.0
         )
         trip = self.trip(way, np.random.default_rng([seed, _OWN, zlib.crc32(self.name.encode()), number]))
-        return replace(trip, name=trip.name or f"way-{self.length_m:g}-{number}")
+        return trip._replace(name=trip.name or f"way-{self.length_m:g}-{number}")
 
 
 def _driving(way: Route, rng: np.random.Generator) -> Trip:

@@ -12,8 +12,8 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ State = tuple[tuple[str, int, str, str], ...]
 """Site, number, state and manifest's address of every version."""
 
 
-@dataclass(frozen=True)
-class Scenario:
+class Scenario(NamedTuple):
     """An operation on the store in folder `start`."""
 
     name: str

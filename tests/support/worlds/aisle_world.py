@@ -1,8 +1,8 @@
 """An aisle of points that look like themselves: maps of it and sessions in it, as the test of joining takes them. No pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise, repeat
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _ONE = np.eye(4)[None]
 _STEP_COV = np.diag([0.003**2] * 3 + [0.015**2] * 3)
 
 
-@dataclass(frozen=True)
-class Aisle:
+class Aisle(NamedTuple):
     """Corners on both sides of an aisle: points_map (N, 3), descriptors (N, 32), and reaches_m (N,) from which each is found."""
 
     points_map: Array

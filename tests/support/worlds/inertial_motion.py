@@ -1,7 +1,7 @@
 """A smooth motion whose place, velocity, rate and specific force are known in closed form, for tests."""
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,7 @@ AMPLITUDE_M, RATE_RADPS, PHASE = np.array([1.5, 1.0, 0.3]), np.array([0.9, 1.3, 
 ROLL, PITCH = (0.15, 1.1), (0.12, 0.8)
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """State at one moment."""
 
     map_from_body: Array

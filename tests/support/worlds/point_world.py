@@ -1,6 +1,6 @@
 """A room of points seen along the analytic motion: the filter without pictures."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +114,7 @@ def use(
     return estimate.update(np.zeros(0, np.int64), np.zeros(0, bool), first_depth_m, iterations, newest)
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """Result of one run."""
 
     filter: InvariantFilter

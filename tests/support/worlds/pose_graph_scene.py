@@ -1,8 +1,8 @@
 """A drive of several laps as a pose graph with known truth, for tests."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,7 @@ ODOMETRY_COV = np.diag([0.002**2, 0.002**2, 0.004**2, 0.02**2, 0.015**2, 0.01**2
 LOOP_COV = np.diag([0.003**2] * 3 + [0.02**2] * 3)
 
 
-@dataclass(frozen=True)
-class Drive:
+class Drive(NamedTuple):
     """truth and start map_from_body (K, 4, 4); edges: odometry, then loops; wrong (loops,)."""
 
     truth: Array
