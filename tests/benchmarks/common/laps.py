@@ -29,13 +29,10 @@ class _Laps(WrappedFrames):
         return _Laps(self.source.part(self.index[indices]), np.arange(len(indices)), self.later_ns[indices])
 
 
-def repeated(recording: Recording, laps: int, seam: tuple[int, int] | None = None) -> Recording:
-    """The recording up to where it is best left for an earlier place, and from there on again, `laps` times in all.
-
-    seam: the frame to go back to, and the one at which; by default the two that are most alike.
-    """
+def repeated(recording: Recording, laps: int) -> Recording:
+    """The recording up to where it is best left for an earlier place, and from there on again, `laps` times in all."""
     stamps_ns, truth = recording.frame_stamps_ns, recording.ground_truth
-    first, last = seam or _seam(truth, stamps_ns)
+    first, last = _seam(truth, stamps_ns)
     start_ns, lap_ns = int(stamps_ns[first]), int(stamps_ns[last] - stamps_ns[first])
     lap = np.arange(first, last)
     index = np.concatenate([np.arange(first), *([lap] * laps)])

@@ -49,8 +49,7 @@ def next_night(folder: Path, *, is_changed: bool) -> list[Tile]:
     """The current tiles; where the night changed something, in one of twenty a twentieth of the landmarks is gone, and as many are new."""
     rng, every = np.random.default_rng(1), round(1 / _CHANGED_SHARE)
     with MapStore.open(folder) as store:
-        current = store.current(SITE)
-        entries = store.manifest(SITE, current.version).tiles
+        entries = store.manifest(SITE, store.current(SITE).version).tiles
         tiles = [decode_tile(store.blob(entry.sha256)) for entry in entries]
     return [_changed(tile, rng) if is_changed and n % every == 0 else tile for n, tile in enumerate(tiles)]
 

@@ -44,8 +44,7 @@ def test_manifests_and_blobs_are_the_stored_bytes(server: Server) -> None:
         assert sha256_hex(tile.content) == entry.sha256
         assert "immutable" in tile.headers["cache-control"]
         assert len(decode_tile(tile.content)) == entry.landmarks
-    vocabulary = server.client.get(f"/v1/vocabularies/{manifest.vocabulary.sha256}")
-    assert vocabulary.content == b"words" * 50
+    assert server.client.get(f"/v1/vocabularies/{manifest.vocabulary.sha256}").content == b"words" * 50
 
 
 def test_etag(server: Server) -> None:

@@ -75,8 +75,7 @@ def test_a_correction_keeps_its_moment_and_reason_until_it_is_another(server: Se
     put(server, drawn("front", correction={"kind": "forget", "reason": "new racks"}))
     ((_, reason, later_ns),) = kept()
     assert (reason, later_ns > since_ns) == ("new racks", True)
-    undone = server.client.post(f"{AREAS}/undo", json=ADA)
-    assert undone.status_code == 200
+    assert server.client.post(f"{AREAS}/undo", json=ADA).status_code == 200
     assert kept() == [("front", ADA["reason"], since_ns)]
     assert listed(server) == "front: 12.0 m2, never-use: racks were moved\n1 areas\n"
     server.client.post(f"{AREAS}/undo", json=ADA)

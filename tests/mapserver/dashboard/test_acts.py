@@ -1,7 +1,6 @@
 """What people change from the dashboard, in a real browser: versions, where a robot stands, what is surveyed again."""
 
 import re
-import time
 from pathlib import Path
 
 import cv2
@@ -27,6 +26,7 @@ from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall
 from support.pages.browser import agree, box_of, fill
 from support.pages.whole_page import assert_whole
 from support.storage.map_samples import draft_details
+from support.waiting import eventually
 
 
 def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
@@ -44,10 +44,7 @@ def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
         page.get_by_label("Heading (°)").fill("90")
         x, y = (float(page.get_by_label(f"{axis} (m)").input_value()) for axis in "xy")
         change(page, "tug-5 is here")
-        deadline_s = time.monotonic() + 20
-        while not heard:
-            assert time.monotonic() < deadline_s
-            page.wait_for_timeout(100)
+        assert eventually(lambda: heard, 20.0)
     assert (heard[0].x_map_m, heard[0].y_map_m, heard[0].heading_rad) == pytest.approx((x, y, 1.5708), abs=1e-3)
 
 

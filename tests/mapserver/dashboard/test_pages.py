@@ -438,7 +438,6 @@ def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -
 
 
 def test_under_another_name_there_is_no_page(page: Page, served: Served) -> None:
-    answer = page.goto(f"http://elsewhere.example:{urlsplit(served.http).port}/dashboard/map")
-    assert answer.status == 403
+    assert page.goto(f"http://elsewhere.example:{urlsplit(served.http).port}/dashboard/map").status == 403
     assert "unknown host name" in page.content()
     watch(page).faults.clear()

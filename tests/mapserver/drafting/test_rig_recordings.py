@@ -63,8 +63,7 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
     frame = rectifier.rectify(frames[0])
     cameras = used_cameras(rectifier)
     assert [number for number, _ in cameras] == [0, 1] and rig_of(rectifier).body_from_cam.shape == (2, 4, 4)
-    sides = replace(calibration, cameras=(*calibration.cameras[:2], calibration.cameras[2]))
-    single = Rectifier(sides)
+    single = Rectifier(replace(calibration, cameras=(*calibration.cameras[:2], calibration.cameras[2])))
     assert rig_of(single).kinds == (CameraKind.STEREO, CameraKind.SINGLE)
     rows = [(0, single.rectify(frames[0]))]
     (seen,) = next(make_keyframes(rows, used_cameras(single), SurveySettings(), SurveyTools())).others

@@ -145,8 +145,7 @@ def test_pages_lead_to_the_other_floors_and_list_robots_where_they_are(house: Pa
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
     with MapStore.open(house) as store:
         keep_areas(store, "hall-2", areas("B", "building"), "", NOBODY)
-        alignment = store.alignment("hall-2")
-        ((ring,),) = read_lifts(store.site_file("hall-2", AREAS), alignment.frame)["B"]
+        ((ring,),) = read_lifts(store.site_file("hall-2", AREAS), store.alignment("hall-2").frame)["B"]
     assert ring[0].tolist() == [-9.0, 1.0]
 
 

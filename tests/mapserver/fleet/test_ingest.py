@@ -44,8 +44,7 @@ def site(metadata_folder: Path) -> Iterator[Site]:
     clock = {"ns": START_NS}
     with MapStore.open(metadata_folder, create=True, clock_ns=lambda: clock["ns"]) as store:
         publish_samples(store, 1)
-        fleet = Fleet(store, clock_ns=lambda: clock["ns"])
-        yield Site(store, fleet, lambda ns: clock.update(ns=ns))
+        yield Site(store, Fleet(store, clock_ns=lambda: clock["ns"]), lambda ns: clock.update(ns=ns))
 
 
 def made(site: Site, count: int, **options: object) -> list[MadeRobot]:
@@ -97,8 +96,7 @@ def test_two_robots_of_one_name_are_told(site: Site, caplog, ahead_s: float) -> 
 
 
 def test_the_store_counts_what_the_robots_know(site: Site) -> None:
-    robots = made(site, 5, rate_per_robot_day=300.0, bad_tile=1, suspected_share=0.3, ahead_s=-7.0)
-    site.run(robots, 600)
+    site.run(made(site, 5, rate_per_robot_day=300.0, bad_tile=1, suspected_share=0.3, ahead_s=-7.0), 600)
     known = site.known
     assert known.failures["site", ""] >= 10
     assert known.suspected["site", ""] >= 5

@@ -59,8 +59,7 @@ def test_two_pins_are_enough_but_check_nothing() -> None:
     fit = fit_pins(pins_at(HALL[:2]), METRES_PER_PX, HALL)
     assert errors(fit, METRES_PER_PX) < (1e-9, 1e-9)
     assert not fit.is_checked
-    line = np.array([(0.0, 0.0), (30.0, 0.0), (60.0, 0.0)])
-    assert not fit_pins(pins_at(line), None, HALL).is_checked
+    assert not fit_pins(pins_at(np.array([(0.0, 0.0), (30.0, 0.0), (60.0, 0.0)])), None, HALL).is_checked
 
 
 @pytest.mark.parametrize(

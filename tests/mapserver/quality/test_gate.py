@@ -62,8 +62,7 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[ProbedFrame]]:
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
     rectifier = Rectifier(rig)
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
-    inputs = SurveyInputs(iter(frames), FRAMES, imu, rig, rectifier)
-    done = survey(inputs, SurveyConfig(SETTINGS, WORDS))
+    done = survey(SurveyInputs(iter(frames), FRAMES, imu, rig, rectifier), SurveyConfig(SETTINGS, WORDS))
     numbers = np.setdiff1d(np.flatnonzero(done.map.trajectory_estimated), done.odometry.keyframe_frames)[:40].tolist()
     seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS.orb) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
@@ -416,8 +415,7 @@ def test_a_recording_that_was_not_shown_to_belong_to_the_site_stops_a_draft(
     """Even forced: the reason is a hard one. Drafts of servers that did not test are not judged by it, and that is said."""
     entry, report = RecordingEntry(name="a", sha256="0" * 64, frames=3), {} if joins is None else {"joins": joins}
     whole = manifest(tiles_from_survey(sound()[0].map), 1)
-    draft = msgspec.structs.replace(whole, recordings=(entry,), report=report)
-    said = judge(draft, None, GateSettings())
+    said = judge(msgspec.structs.replace(whole, recordings=(entry,), report=report), None, GateSettings())
     assert said.accepted is passes
     assert bool(said.hard_reasons) is not passes
     assert ("joining" in said.report["not_judged"]) is (joins is None)

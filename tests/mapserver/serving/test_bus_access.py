@@ -161,8 +161,7 @@ def test_rules_follow_the_register(register: RobotRegister, caplog) -> None:
         assert not guard.follow()
         (entry,) = register.robots()
         with MemoryBus(hub, entry.bundle) as fresh:
-            key = enrolment.new_key()
-            question = enrolment.renewal_request(bundle.own.encode(), key)
+            question = enrolment.renewal_request(bundle.own.encode(), enrolment.new_key())
             assert fresh.get(robot_key("lab", "r2", "renew"), question)
             with pytest.raises(UnreachableError):
                 fresh.get(robot_key("lab", "r2", "wanted"))

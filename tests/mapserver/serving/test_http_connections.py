@@ -25,6 +25,7 @@ from mapserver.store import Actor, MapStore
 from mapserver.trust.authorities import Authorities
 from support.fleet.dashboard_scene import serving
 from support.storage.map_samples import save_sample_draft
+from support.waiting import eventually
 
 GET = b"GET /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
 POST = b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n%s"
@@ -181,10 +182,8 @@ def test_connections_are_shared_among_addresses(monkeypatch, is_behind_proxy: bo
         # All are taken: another address gets a place of who has most, but not more than these.
         assert take("127.0.0.3", 3) == [True, True, False]
         stack.close()
-        deadline = time.monotonic() + 10
-        while not all(take("127.0.0.4", 4)):  # closed ones do not count, as soon as the server notices
-            stack.close()
-            assert time.monotonic() < deadline
+        # Closed ones do not count, as soon as the server notices.
+        assert eventually(lambda: all(take("127.0.0.4", 4)) or stack.close())
 
 
 def test_files_are_kept_for_the_store_and_the_bus(monkeypatch) -> None:
@@ -197,9 +196,7 @@ def test_files_are_kept_for_the_store_and_the_bus(monkeypatch) -> None:
             for _ in range(top // 2 + 1):  # two files each
                 last = stack.enter_context(door.connect(source="127.0.0.2"))
             assert is_ended(last)
-        deadline = time.monotonic() + 10
-        while not is_answered(door, "127.0.0.3"):  # it goes on, as soon as the server notices
-            assert time.monotonic() < deadline
+        assert eventually(lambda: is_answered(door, "127.0.0.3")), "it goes on, as soon as the server notices"
 
 
 def test_a_robot_is_served_while_strangers_do_their_worst(tmp_path: Path) -> None:

@@ -173,8 +173,7 @@ def test_what_is_published_is_kept_first() -> None:
     assert set(ids[again]) >= set(worst) & set(seen)
     assert again.sum() == 100
     # Nothing else changed, so nothing changes.
-    once_more = choose_landmarks(survey, exactly(100), published=ids[again])
-    np.testing.assert_array_equal(once_more, again)
+    np.testing.assert_array_equal(choose_landmarks(survey, exactly(100), published=ids[again]), again)
 
 
 def test_tiles_stay_below_their_limit() -> None:

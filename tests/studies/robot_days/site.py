@@ -73,16 +73,14 @@ def random_route(rng: np.random.Generator, length_m: float, stop_s: float = 0.0)
         if goes_on and rng.random() < 0.4:
             line += ahead
         else:
-            others = [a for a in range(LAYOUT.aisles) if a != aisle]
-            aisle = int(rng.choice(others))
+            aisle = int(rng.choice([a for a in range(LAYOUT.aisles) if a != aisle]))
             points.append((x_m, y_m))
             driven_m += abs(points[-1][0] - points[-2][0])
             after_m = LAYOUT.aisle_y_m(aisle) + float(rng.uniform(-_ASIDE_M, _ASIDE_M))
             driven_m += abs(after_m - y_m)
             y_m = after_m
             points.append((x_m, y_m))
-            ways = [way for way in (-1, 1) if 0 <= line + way < len(xs)]
-            ahead = int(rng.choice(ways))
+            ahead = int(rng.choice([way for way in (-1, 1) if 0 <= line + way < len(xs)]))
             line += ahead
     # The walk ends in the aisle that it has turned into.
     points.append((points[-1][0] + ahead * 8.0, y_m))

@@ -84,8 +84,7 @@ def detect(
     state, words = mixed(keys[:, 0], 40), np.empty((len(rows), 4), np.uint64)
     for word in range(4):
         state = words[:, word] = mixed(state, word)
-    count = np.full(len(rows), model.dirt_bits)
-    _change_bits(words, mixed(keys[:, 0], keys[:, 1]), count)
+    _change_bits(words, mixed(keys[:, 0], keys[:, 1]), np.full(len(rows), model.dirt_bits))
     _change_bits(words, view, np.full(len(rows), model.view_bits))
     noise = (model.noise_bits * 2.0 * uniform(mixed(now, 44)) + 0.5).astype(np.int64)
     _change_bits(words, mixed(now, 43), noise)

@@ -55,8 +55,7 @@ def code_words(cell: str) -> list[str]:
 def click_command(path: str) -> click.Command:
     """A command by its words, such as "mapserver build", as its script has it."""
     script, *words = path.split()
-    project = tomllib.loads(text("pyproject.toml"))["project"]
-    module = project["scripts"][script].partition(":")[0]
+    module = tomllib.loads(text("pyproject.toml"))["project"]["scripts"][script].partition(":")[0]
     found = typer.main.get_command(importlib.import_module(module).app)
     for word in words:
         found = found.get_command(None, word)  # type: ignore[attr-defined]

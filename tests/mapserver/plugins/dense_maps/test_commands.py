@@ -101,8 +101,7 @@ def test_grid_and_surfels_travel_with_the_archive_and_go_with_their_version(
     run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4)
     # What is damaged is told.
     manifest = store.manifest("lab", 4)
-    path = next((tmp_path / "store").glob(f"blobs/*/{manifest.report['grid']['sha256']}"))
-    path.write_bytes(b"{}")
+    next((tmp_path / "store").glob(f"blobs/*/{manifest.report['grid']['sha256']}")).write_bytes(b"{}")
     assert "damaged" in run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4, status=3)
 
 

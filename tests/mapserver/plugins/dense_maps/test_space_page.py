@@ -176,8 +176,7 @@ def test_robots_and_places_are_opened_with_the_pointer(page: Page, served: Serve
     there = box["x"] + robot["page"][0] * box["width"], box["y"] + robot["page"][1] * box["height"]
     page.mouse.click(*there)
     expect(page.locator(".where")).to_have_text(re.compile("^Place "))
-    beside = pytest.approx((robot["x"], robot["y"]), abs=1.0)
-    assert page.evaluate(SEEN)["camera"][:2] == beside
+    assert page.evaluate(SEEN)["camera"][:2] == pytest.approx((robot["x"], robot["y"]), abs=1.0)
     page.get_by_role("button", name="Leave the walk").click()
     page.get_by_role("button", name="From above").click()
     page.get_by_role("checkbox", name="robots").check()

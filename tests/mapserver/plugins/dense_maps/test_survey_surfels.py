@@ -151,8 +151,7 @@ def test_a_room_has_its_walls_and_nothing_behind_them(has_depth: bool) -> None:
 
 
 def test_a_camera_that_is_carried_by_hand_has_no_floor() -> None:
-    heights = [0.6, 0.75, 0.9, 1.05, 1.2, 1.35]
-    _, without = grown_grid({}, [session_at(ride(heights))])
+    _, without = grown_grid({}, [session_at(ride([0.6, 0.75, 0.9, 1.05, 1.2, 1.35]))])
     assert "carried by hand" in without["ride"]
 
 

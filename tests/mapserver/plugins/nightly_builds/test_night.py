@@ -167,8 +167,7 @@ def test_some_robots_try_a_nights_version_first(hall: Path) -> None:
 
 def test_each_recording_goes_where_it_belongs_with_its_reason(hall: Path) -> None:
     record(hall / "inbox", "lost one", 7)
-    dark = record(hall / "inbox", "dark one", 8)
-    max((dark / "mav0/cam1/data").iterdir()).unlink()
+    max((record(hall / "inbox", "dark one", 8) / "mav0/cam1/data").iterdir()).unlink()
     (hall / "inbox/empty").mkdir()
     (hall / "inbox/notes.txt").write_text("not for the night")
     assert "2 done, 1 held, 2 bad" in spend(hall)

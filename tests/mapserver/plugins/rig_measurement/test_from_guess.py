@@ -66,8 +66,7 @@ def matches(stretch: Stretch, rig: RigCalibration, keyframes: range, seed: int) 
 def test_lenses_are_found_from_a_focal_length_of_the_image_width(loop: Stretch) -> None:
     """Truth: 420 of 640 px, a third less than the guess, and a distortion of 20 % at the corner."""
     true = bent(loop.session.true)
-    found = guessed_rig(first_rig(640, 480, 0.12), matches(loop, true, range(0, 40, 3), 1))
-    left, right = found.cameras
+    left, right = guessed_rig(first_rig(640, 480, 0.12), matches(loop, true, range(0, 40, 3), 1)).cameras
     assert left.intrinsics_px[0] == pytest.approx(420.0, rel=0.1)
     assert left.distortion[0] == pytest.approx(-0.28, abs=0.08)
     turn = np.degrees(so3_log((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, :3]))

@@ -129,8 +129,7 @@ def test_priors_alone_can_hold_the_map() -> None:
     truth = make_scene(keyframes=5, landmarks=100, step_s=0.4, seed=13).problem
     moved_from_map = se3_exp(np.array([0.0, 0, 0.1, 1.0, -0.5, 0.2]))
     priors = [PriorTerm(k, moved_from_map @ truth.map_from_body[k], 1e6 * np.eye(6)) for k in (0, 4)]
-    problem = replace(truth, fixed=np.zeros(5, np.bool_), priors=priors)
-    result = optimize(problem, PRECISE)
+    result = optimize(replace(truth, fixed=np.zeros(5, np.bool_), priors=priors), PRECISE)
     np.testing.assert_allclose(result.map_from_body, moved_from_map @ truth.map_from_body, atol=1e-4)
 
 

@@ -93,8 +93,7 @@ def test_the_medoid_is_the_nearest_to_all_others() -> None:
 def test_only_what_could_be_one_landmark_is_a_duplicate() -> None:
     """Five near pairs: alike; unlike; too far for their sigmas; seen side by side; alike again, the less observed one goes."""
     rng = np.random.default_rng(5)
-    base = rng.integers(0, 256, (5, 32)).astype(np.uint8)
-    words = np.repeat(base, 2, axis=0)
+    words = np.repeat(rng.integers(0, 256, (5, 32)).astype(np.uint8), 2, axis=0)
     words[3] = ~words[3]
     points = np.repeat(10.0 * np.arange(5.0), 2)[:, None] * np.ones(3)
     points[1::2] += 0.01

@@ -146,8 +146,7 @@ def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(
 ) -> None:
     """Nothing in the survey looks like the wall but the wall itself; the next aisle, 1.5 m aside, may not have been seen yet."""
     settings = replace_loops(SETTINGS, repeats_every_m=1.5)
-    shift = np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0])
-    loops = closed(shift, sigma_m, settings=settings)
+    loops = closed(np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0]), sigma_m, settings=settings)
     assert {r.verdict for r in wall_records(loops) if r.i - r.j == 10} == {verdict}
     assert bool(loops.edges) is (verdict is LoopVerdict.ACCEPTED)
 

@@ -58,8 +58,7 @@ def test_bounds_hold_for_cells_that_stay_or_go_by_whole_blocks() -> None:
     rng, missed, naive = np.random.default_rng(7), 0, 0
     cells = np.array([(x, y, 0) for x in range(40) for y in range(2)])
     for seed in range(300):
-        stands = np.repeat(rng.random(20) < 0.5, 4)
-        seen = confirmed(cells, stands, 0.9, seed)
+        seen = confirmed(cells, np.repeat(rng.random(20) < 0.5, 4), 0.9, seed)
         missed += not seen.low <= 0.5 <= seen.high
         low = float(beta.ppf(RATE, max(seen.seen, 1), seen.cells - seen.seen + 1))
         naive += low > 0.5

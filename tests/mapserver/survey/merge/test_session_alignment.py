@@ -39,8 +39,7 @@ def shifted(metres: float) -> Array:
 
 def test_agreeing_fixes_are_one_set_and_strays_do_not_matter() -> None:
     fixes = [fix(k, MAP_FROM_SURVEY) for k in range(0, 20, 2)]
-    strays = [fix(3, shifted(9.0)), fix(7, shifted(-4.0)), fix(8, shifted(2.5))]
-    placed = found([*strays, *fixes])
+    placed = found([fix(3, shifted(9.0)), fix(7, shifted(-4.0)), fix(8, shifted(2.5)), *fixes])
     assert {f.k for f in placed[0].fixes} == set(range(0, 20, 2))
     assert placed[0].places == 5  # two steps round the bend are a little less than a metre
     assert [len(p.fixes) for p in placed[1:]] == [1, 1, 1]

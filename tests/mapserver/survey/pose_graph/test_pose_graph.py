@@ -29,8 +29,7 @@ def test_benchmark_problems_end_where_gtsam_ends(name: str) -> None:
     file = real_data("pose_graphs") / f"{name}.g2o"
     map_from_body, edges = parse_g2o(file.read_text())
     graph, values = gtsam.readG2o(str(file), True)
-    anchor = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), anchor))
+    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
     result = optimize_pose_graph(map_from_body, edges, robust=False)
     assert result.cost == pytest.approx(graph.error(optimum), rel=1e-4)

@@ -61,8 +61,7 @@ def test_places_that_look_away_are_no_candidates() -> None:
 
 
 def matches(predicted_places: Array, allowed_m: float, sigma_rad: float | None = 0.02) -> set[tuple[int, int]]:
-    candidates = [(3, 4), (4, 5), (0, 9)]
-    found = finder(predicted_places).match(candidates, lambda i, j: allowed_m, sigma_rad)
+    found = finder(predicted_places).match([(3, 4), (4, 5), (0, 9)], lambda i, j: allowed_m, sigma_rad)
     return {(m.i, m.j) for m in found}
 
 
@@ -116,8 +115,7 @@ def test_what_is_looked_at_does_not_grow_with_the_site() -> None:
     rng, looked = np.random.default_rng(5), []
     for count in (1000, 2000):
         positions = np.column_stack([0.5 * np.arange(count), rng.uniform(0.0, 20.0, count), np.zeros(count)])
-        reach = np.where(np.arange(count) % 5, 4.0, 30.0)
-        around = NearPlaces(positions, reach)
+        around = NearPlaces(positions, np.where(np.arange(count) % 5, 4.0, 30.0))
         looked.append(np.mean([len(around.before(j, j)) for j in range(count)]))
     assert looked[1] < 1.1 * looked[0]
     assert looked[1] > 15.0

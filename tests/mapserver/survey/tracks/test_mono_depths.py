@@ -7,8 +7,7 @@ from mapserver.survey.tracks.mono_depths import fuse_inverse_depths
 
 
 def test_views_that_agree_are_averaged_by_their_weight() -> None:
-    rows = np.array([[2, 0.50, 0.01], [2, 0.52, 0.02], [0, 0.2, 0.001]])
-    fused = fuse_inverse_depths(rows, 3, 0.1)
+    fused = fuse_inverse_depths(np.array([[2, 0.50, 0.01], [2, 0.52, 0.02], [0, 0.2, 0.001]]), 3, 0.1)
     assert fused[2, 0] == pytest.approx((0.50 * 4 + 0.52) / 5)
     assert fused[2, 1] == pytest.approx(0.01 / np.sqrt(1.25))
     assert fused[0].tolist() == pytest.approx([0.2, 0.001])
