@@ -149,13 +149,7 @@ ROTATED = "images of both cameras are rotated by 180 degrees: switch the driver'
     ],
 )
 def test_a_ros_1_bag_with_a_fault_is_named_alike(
-    ride: Recording,
-    tmp_path: Path,
-    monkeypatch,
-    kind: str,
-    change: Callable[[Any], None],
-    name: str,
-    says: str,
+    ride: Recording, tmp_path: Path, monkeypatch, kind: str, change: Callable[[Any], None], name: str, says: str
 ) -> None:
     """The messages of the ride, changed and written by rosbags; its CameraInfo has five coefficients."""
     monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))

@@ -211,10 +211,7 @@ def test_failures_happen_when_the_servers_clock_says(site: Site) -> None:
 
 def test_what_cannot_be_is_refused_for_good(site: Site) -> None:
     (report, *_) = site.run(made(site, 1, rate_per_robot_day=5000.0), 100)
-    wrong = [
-        replace_struct(report, robot="r7"),
-        replace_struct(report, id="x", site="nowhere"),
-    ]
+    wrong = [replace_struct(report, robot="r7"), replace_struct(report, id="x", site="nowhere")]
     count = len(site.store.fleet.failures(FailureFilter()))
     for message in wrong:
         sender = "nowhere" if message.site == "nowhere" else "lab"

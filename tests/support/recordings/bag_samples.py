@@ -19,10 +19,7 @@ _STORE1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms
 
 
 def edited(
-    messages: Iterable[Message],
-    topic: str,
-    change: dict[str, Any] | Callable[[Any], None],
-    rows: slice = slice(None),
+    messages: Iterable[Message], topic: str, change: dict[str, Any] | Callable[[Any], None], rows: slice = slice(None)
 ) -> list[Message]:
     """The messages, those of a topic in these rows changed in rosbags' form: fields by dotted names, or by a function of it."""
     edited = list(messages)

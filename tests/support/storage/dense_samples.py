@@ -7,14 +7,7 @@ import msgspec
 import numpy as np
 
 from mapserver.drafting.draft_evidence import MappedSession
-from mapserver.plugins.dense_maps.surfel_map import (
-    EDGE_M,
-    TILE_SIZE_M,
-    SurfelReport,
-    Surfels,
-    SurfelTiles,
-    encode_tile,
-)
+from mapserver.plugins.dense_maps.surfel_map import EDGE_M, TILE_SIZE_M, SurfelReport, Surfels, SurfelTiles, encode_tile
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
 from mapserver.store import MapStore
 from mapserver.store.survey_pictures import SurveyPicture

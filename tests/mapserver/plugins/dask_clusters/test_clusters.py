@@ -40,10 +40,7 @@ def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Client]:
-    with (
-        LocalCluster(n_workers=1, dashboard_address=None, **IN_THREADS) as there,
-        Client(there) as client,
-    ):
+    with LocalCluster(n_workers=1, dashboard_address=None, **IN_THREADS) as there, Client(there) as client:
         yield client
 
 
