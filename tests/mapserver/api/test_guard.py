@@ -12,7 +12,6 @@ import anyio
 import pytest
 from fastapi.testclient import TestClient
 from starlette.responses import Response
-from starlette.types import ASGIApp, Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleetmap.errors import StoreError
@@ -23,7 +22,7 @@ from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.install import install_sign_in
 from mapserver.operators.operators import IDLE_S, Operators
 from mapserver.store import Actor
-from support.fleet.served_api import Server, check_problem, named
+from support.fleet.served_api import Server, check_problem, named, raw
 from support.storage.map_samples import save_sample_draft
 
 PASSWORD = "a password of the test"
@@ -227,26 +226,11 @@ def test_a_slow_or_large_sign_in_is_refused_and_one_that_leaves_is_no_error(
 ) -> None:
     monkeypatch.setattr(request_limits, "SIGN_IN_S", 0.1)
     monkeypatch.setattr(request_limits, "LINGER_S", 0.1)
-    headers = [(b"host", b"127.0.0.1"), (b"content-type", b"application/x-www-form-urlencoded")]
-    scope = {"type": "http", "method": "POST", "path": "/sign-in", "raw_path": b"/sign-in", "query_string": b""}
-    scope |= {"headers": headers, "client": ("10.0.0.1", 1), "scheme": "http", "http_version": "1.1", "root_path": ""}
+    form, scope = (
+        [(b"content-type", b"application/x-www-form-urlencoded")],
+        {"method": "POST", "path": "/sign-in", "query_string": b""},
+    )
     part = {"type": "http.request", "body": b"x" * 3000, "more_body": True}
-
-    async def ask(app: ASGIApp, *messages: Message) -> list[int]:
-        """The statuses that answer these messages and, behind them, nothing more."""
-        waiting, answered = list(messages), []
-
-        async def receive() -> Message:
-            if not waiting:
-                await anyio.sleep(20)
-            return waiting.pop(0)
-
-        async def send(message: Message) -> None:
-            answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
-
-        await app(dict(scope), receive, send)
-        return answered
-
     with client_of(server) as client:
         Operators(server.store).add("ada", "admin", PASSWORD, Actor("root"))
         install_sign_in(client.app, GuardSettings(operators=Operators(server.store)))
@@ -256,8 +240,7 @@ def test_a_slow_or_large_sign_in_is_refused_and_one_that_leaves_is_no_error(
             ([part, {"type": "http.disconnect"}], []),
             ([part | {"more_body": False}], [401]),
         ):
-            assert anyio.run(ask, client.app, *messages) == statuses
-        long = [*headers, *((b"cookie", b"a" * 3000) for _ in range(6))]
-        scope["headers"] = long
-        assert anyio.run(ask, client.app, part | {"more_body": False}) == [431]
+            assert anyio.run(raw, client.app, scope, form, *messages, 20.0) == statuses
+        long = [*form, *((b"cookie", b"a" * 3000) for _ in range(6))]
+        assert anyio.run(raw, client.app, scope, long, part | {"more_body": False}) == [431]
     assert not [record for record in caplog.records if record.levelname == "ERROR"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import anyio
 import httpx
 from fastapi.testclient import TestClient
-from starlette.types import Message
+from starlette.types import ASGIApp, Message
 
 from mapserver.api.app import create_app
 from mapserver.api.parameters import ApiSettings
@@ -66,11 +66,20 @@ def check_problem(response: httpx.Response, status: int, words: str) -> None:
 async def raw_put(
     server: Server, path: str, *messages: Message | anyio.Event | float, stated: int, query: bytes = b""
 ) -> list[int]:
+    """As `raw`: an upload that is said to have so many bytes."""
+    scope = {"method": "PUT", "path": path, "query_string": b"actor=ada" + query}
+    return await raw(server.client.app, scope, [(b"content-length", b"%d" % stated)], *messages)
+
+
+async def raw(
+    app: ASGIApp,
+    changes: dict[str, object],
+    headers: list[tuple[bytes, bytes]],
+    *messages: Message | anyio.Event | float,
+) -> list[int]:
     """The status of a request whose client sends these and waits for events and seconds; empty if it is gone before the answer."""
-    scope = {
-        "type": "http", "method": "PUT", "path": path, "raw_path": b"", "scheme": "http", "query_string": b"actor=ada" + query,
-        "headers": [(b"host", b"127.0.0.1"), (b"content-length", b"%d" % stated)], "client": ("127.0.0.1", 1),
-    }  # fmt: skip
+    scope = {"type": "http", "raw_path": b"", "scheme": "http", "root_path": "", "client": ("127.0.0.1", 1), **changes}
+    scope["headers"] = [(b"host", b"127.0.0.1"), *headers]
     left, answered = list(messages), list[int]()
 
     async def receive() -> Message:
@@ -86,5 +95,5 @@ async def raw_put(
     async def send(message: Message) -> None:
         answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
 
-    await server.client.app(scope, receive, send)
+    await app(scope, receive, send)
     return answered
