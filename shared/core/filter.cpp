@@ -603,16 +603,12 @@ std::tuple<SE3, Mat6> Filter::motion_since(int64_t id) const {
   const Matrix& c = true_error_cov;
   const size_t index = index_of(id);
   const size_t at = clone_errors(kConsidered, index).rotation, end = clone_errors(kConsidered, clones_.size() - 1).rotation;
-  double difference[6][6], adjoint[36] = {};
+  Mat6 gained;
   for (size_t a = 0; a < 6; ++a)
-    for (size_t b = 0; b < 6; ++b) difference[a][b] = c[end + a][end + b] + c[at + a][at + b] - c[end + a][at + b] - c[at + a][end + b];
+    for (size_t b = 0; b < 6; ++b) gained[a][b] = c[end + a][end + b] + c[at + a][at + b] - c[end + a][at + b] - c[at + a][end + b];
   const SE3 earlier_from_odom = inverse(clones_[index]);
-  Mat6 covariance;
-  store(earlier_from_odom.rotation, adjoint, 6);
-  store(earlier_from_odom.rotation, adjoint + 21, 6);
-  store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, adjoint + 18, 6);
-  carry<6, 6>(adjoint, difference[0], covariance.at);
-  return {earlier_from_odom * clones_.back(), covariance};
+  const Mat3& turn = earlier_from_odom.rotation;
+  return {earlier_from_odom * clones_.back(), carried(gained, turn, skew(earlier_from_odom.translation) * turn)};
 }
 
 SE3 Filter::cam_from_earlier(int64_t id, const SE3& cam_from_body, size_t camera) const {

@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "dense.h"
+
 namespace fleetmap {
 
 struct Vec3 {
@@ -172,6 +174,14 @@ inline void store(const Mat6& a, double* to) { std::copy_n(a.at, 36, to); }
 inline Mat6 mat6(const double* from) {
   Mat6 out;
   std::copy_n(from, 36, out.at);
+  return out;
+}
+// The covariance of what a matrix makes of a perturbation: `turn` twice on its diagonal, `below` in its lower left corner.
+inline Mat6 carried(const Mat6& covariance, const Mat3& turn, const Mat3& below) {
+  double matrix[36]{};
+  store(turn, matrix, 6), store(turn, matrix + 21, 6), store(below, matrix + 18, 6);
+  Mat6 out;
+  carry<6, 6>(matrix, covariance.at, out.at);
   return out;
 }
 

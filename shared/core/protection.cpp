@@ -87,22 +87,12 @@ double factor_of(double probability) {
 }
 
 // The covariance about a point of the body, `lever` from its origin in map axes.
-Mat6 about(const Mat6& covariance, Vec3 lever) {
-  double carried[36]{};
-  for (const int corner : {0, 21}) store(kIdentity, carried + corner, 6);
-  store(-1.0 * skew(lever), carried + 18, 6);
-  Mat6 out;
-  carry<6, 6>(carried, covariance.at, out.at);
-  return out;
-}
+Mat6 about(const Mat6& covariance, Vec3 lever) { return carried(covariance, kIdentity, -1.0 * skew(lever)); }
 
 // Moves a mode by a way of the body, whose covariance is about its end.
 void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
-  double turn[36]{};
-  for (const int corner : {0, 21}) store(mode.map_from_body.rotation, turn + corner, 6);
-  Mat6 turned;
-  carry<6, 6>(turn, cov_way.at, turned.at);
-  mode.covariance = about(mode.covariance, mode.map_from_body.rotation * way.translation) + turned;
+  const Mat3& turn = mode.map_from_body.rotation;
+  mode.covariance = about(mode.covariance, turn * way.translation) + carried(cov_way, turn, {});
   mode.map_from_body = mode.map_from_body * way;
 }
 

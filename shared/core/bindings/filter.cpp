@@ -133,14 +133,9 @@ auto linearise_track_of(const Vec3& point, const Transforms& odom_from_cam, cons
 // independently of each other, SO(3) x R^3, as the given one; cov_step (6, 6) is a left perturbation of the step in the body's axes about
 // the body. Source: Barfoot and Furgale 2014.
 std::tuple<SE3, Mat6> compose_pose(const SE3& map_from_body, const Mat6& covariance, const SE3& body_from_next, const Mat6& cov_step) {
-  double turn[36]{}, lever[36]{}, total[36];
-  for (const int corner : {0, 21}) store(map_from_body.rotation, turn + corner, 6), store(kIdentity, lever + corner, 6);
-  store(-1.0 * skew(map_from_body.rotation * body_from_next.translation), lever + 18, 6);
-  carry<6, 6>(turn, cov_step.at, total);
-  for (int k = 0; k < 36; ++k) total[k] = covariance.at[k] + total[k];
-  Mat6 composed;
-  carry<6, 6>(lever, total, composed.at);
-  return {map_from_body * body_from_next, composed};
+  const Mat3& turn = map_from_body.rotation;
+  const Mat6 total = covariance + carried(cov_step, turn, {});
+  return {map_from_body * body_from_next, carried(total, kIdentity, -1.0 * skew(turn * body_from_next.translation))};
 }
 
 }  // namespace
