@@ -66,18 +66,13 @@ class Prior:
 
     @classmethod
     def given(
-        cls,
-        prior: PositionPrior,
-        odometry: OdometryEstimate,
-        base_from_body: Array,
-        settings: TrackSettings,
-        **how: Any,
+        cls, told: PositionPrior, odometry: OdometryEstimate, base_from_body: Array, settings: TrackSettings, **how: Any
     ) -> "Prior":
         """Return a prior from outside at a frame. how: arguments of the constructor."""
-        base, known = Place(prior.map_from_base, prior.cov_rot_trans, prior.floor or ""), None
-        if np.isfinite(prior.cov_rot_trans).all():
+        base, known = Place(told.map_from_base, told.cov_rot_trans, told.floor or ""), None
+        if np.isfinite(told.cov_rot_trans).all():
             known = PoseHypothesis.at(odometry, base.of_point(base_from_body))
-        how = {"is_revisable": prior.is_revisable, "is_measured": prior.is_measured, "is_told": True} | how
+        how = {"is_revisable": told.is_revisable, "is_measured": told.is_measured, "is_told": True} | how
         return cls(base, PoseHypothesis.at(odometry), known, base_from_body, settings, **how)
 
     @property
