@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import SITE, mapped, played
+from benchmarks.common.recorded_runs import SITE, mapped, played, rendered
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, record_order
-from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.recorder import Order
+from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors import Fault
 from locclient.maps.map_client import MapClient
@@ -55,37 +55,28 @@ def snake(layout: Layout) -> Route:
     return Route((*points, points[0], (ends[0] + 6.0, points[0][1])))
 
 
-def tour(layout: Layout, aisles: tuple[int, int, int] = (0, 3, 4)) -> Route:
+def tour(layout: Layout) -> Route:
     """An aisle of each third, each in the direction that surveys drive it: even ones, odd ones back, even ones."""
-    y, left, right = [layout.aisle_y_m(aisle) for aisle in aisles], 2.7, layout.length_m - 2.7
+    y, left, right = [layout.aisle_y_m(aisle) for aisle in (0, 3, 4)], 2.7, layout.length_m - 2.7
     return Route(((left, y[0]), (right, y[0]), (right, y[1]), (left, y[1]), (left, y[2]), (right, y[2])))
 
 
-def scenario(night: int, aisles: tuple[int, int, int] = (0, 3, 4)) -> Scenario:
-    """The site on the day after a night, with the survey of that night and the robot of the day, in these aisles."""
+def scenario(night: int) -> Scenario:
+    """The site on the day after a night, with the survey of that night and the robot of the day."""
     layout = BEFORE if night < MOVED else AFTER
     surveyed = (3, 4) if night in CLOSED and night % 3 == 1 else THIRDS[night % 3]  # an aisle is closed for four nights
     route = snake(layout) if night == 0 else loop(layout, *surveyed)
     dark = (Fault("camera-dark", 4.0, 1e6),) if night == DARK else ()
     survey = Run("surveyor", (route,), rate_hz=7.5, is_sharp=True, faults=dark)
-    return Scenario(
-        "", layout, {f"survey-{night}": survey, f"robot-{night}": Run("tote", (tour(layout, aisles),), 10.0)}
-    )
+    return Scenario("", layout, {f"survey-{night}": survey, f"robot-{night}": Run("tote", (tour(layout),), 10.0)})
 
 
-def record(night: int, run: str, seed: int = SEED) -> str:
+def record(night: int, run: str, seed: int = SEED) -> Path:
     """Path of a recording in the inbox, or beside it for robots. Light turns with the seasons."""
     folder = WORK if run == "robot" else WORK / "inbox"
     path, light = folder / f"{run}-{night}-{seed}.mcap", "evening" if 10 <= night < 20 else "day"
-    SCENARIOS[SCENARIO] = partial(scenario, night)
     day = night if run != "robot" else night + 1
-    try:
-        order = Order(SCENARIO, seed=seed, day=day, light=light, robot=f"{run}-{night}")
-        record_order(order, path.with_suffix(".part"))
-    finally:
-        del SCENARIOS[SCENARIO]
-    path.with_suffix(".part").rename(path)
-    return str(path)
+    return rendered(path, Order(SCENARIO, seed, day, light, f"{run}-{night}"), scenario(night))
 
 
 def night(number: int) -> Row:
@@ -94,7 +85,7 @@ def night(number: int) -> Row:
     if number == 0:
         shutil.rmtree(WORK, ignore_errors=True)
         (WORK / "inbox").mkdir(parents=True)
-        mapped(store, Path(record(0, "survey")), WORK / "survey.json")
+        mapped(store, record(0, "survey"), WORK / "survey.json")
         said = {"state": "done", "version": 1, "recordings": [], "message": ""}
     else:
         if not store.exists():
@@ -167,7 +158,7 @@ def sits_on(points_map: Array) -> dict[str, Array]:
 
 def robot(number: int) -> Row:
     """A robot that wakes in the site on the next day and drives through all thirds of it."""
-    path = Path(record(number, "robot"))
+    path = record(number, "robot")
     frames = played(path, WORK / "store").frames
     path.unlink()
     errors = run_metrics.error_m(frames)

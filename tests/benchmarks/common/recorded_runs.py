@@ -11,11 +11,14 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import psutil
 
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.source import ReplaySource
+from fleetsim.recorder import Order, record_order
+from fleetsim.scenarios import SCENARIOS, Scenario
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_client import connected
@@ -85,6 +88,16 @@ def recorded(work: Path, options: tuple[str, ...], scenario: str = "small-loop")
     if not (work / name).exists():
         subprocess.run([*tool("fleetsim"), "record", scenario, *options, "--out", str(work / name)], check=True)
     return work / name
+
+
+def rendered(path: Path, order: Order, scenario: Scenario) -> Path:
+    """The recording of a run of this scenario, made where it is not there yet."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with patch.dict(SCENARIOS, {order.scenario: lambda: scenario}):
+            record_order(order, path.with_suffix(".part"))
+        path.with_suffix(".part").rename(path)
+    return path
 
 
 def surveyed(work: Path, seed: int | None = None, scenario: str = "small-loop") -> Path:

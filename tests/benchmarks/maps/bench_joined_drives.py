@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import Options, Results, benchmark
+from benchmarks.common.recorded_runs import Options, Results, benchmark, rendered
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, record_order
-from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.recorder import Order
+from fleetsim.scenarios import Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings
 from mapserver.drafting import survey_recordings
@@ -56,13 +56,8 @@ def blocks() -> Scenario:
 
 
 def recorded(seed: int, n: int, work: Path) -> Path:
-    """The recording of a drive, rendered unless the work folder has it."""
-    path = work / f"blocks-{seed}-{n}.mcap"
-    if not path.exists():
-        SCENARIOS["blocks"] = blocks
-        record_order(Order("blocks", seed, robot=f"drive-{n}"), path.with_suffix(".part"))
-        path.with_suffix(".part").rename(path)
-    return path
+    """The recording of a drive."""
+    return rendered(work / f"blocks-{seed}-{n}.mcap", Order("blocks", seed, robot=f"drive-{n}"), blocks())
 
 
 def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> survey_recordings.RecordingSurvey:

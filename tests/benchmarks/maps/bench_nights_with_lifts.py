@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import Options, Results, benchmark, played
+from benchmarks.common.recorded_runs import Options, Results, benchmark, played, rendered
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat.tile import decode_tile
@@ -26,7 +26,7 @@ from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.motion import Route
-from fleetsim.recorder import Order, Session, record_order
+from fleetsim.recorder import Order, Session
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.sensors import Fault, HiddenErrors
 from locclient.replay import run_metrics
@@ -74,16 +74,11 @@ def exchanged(session: Session) -> Iterator[CameraFrame]:
 
 
 def recorded(path: Path, run: Run, seed: int, day: int, kind: str = "", hidden: HiddenErrors = NOTHING) -> Path:
-    """The recording of a run, rendered unless it is there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not path.exists():
-        SCENARIOS["nights"] = lambda: replace(CLIP, runs={"drive": run})
-        is_exchanged = kind == "exchanged"
-        order = Order("nights", seed, day, robot="drive", rig="front-rear" if is_exchanged else "pair", hidden=hidden)
-        with patch.object(Session, "frames", exchanged if is_exchanged else _frames):
-            record_order(order, path.with_suffix(".part"))
-        path.with_suffix(".part").rename(path)
-    return path
+    """The recording of a run."""
+    rig, frames = ("front-rear", exchanged) if kind == "exchanged" else ("pair", _frames)
+    with patch.object(Session, "frames", frames):
+        order = Order("nights", seed, day, robot="drive", rig=rig, hidden=hidden)
+        return rendered(path, order, replace(CLIP, runs={"drive": run}))
 
 
 def surveyed(folder: Path, seed: int) -> None:

@@ -1,8 +1,8 @@
 """Results of surveys of the box room, without surveying it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +10,8 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from fleetmap.version_grid import Tiles
 from mapserver.drafting.draft_evidence import MappedSession
-from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
-from mapserver.plugins.dense_maps.survey_grid import GridGrower, grow
-from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
+from mapserver.plugins.dense_maps.survey_grid import grow
 from mapserver.survey.rig import Rig
 from mapserver.survey.state import ImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
@@ -57,15 +54,6 @@ def ride(height_m: list[float]) -> list[Array]:
     ]
 
 
-def grown_grid(before: Tiles, sessions: Sequence[MappedSession]) -> tuple[Tiles, dict[str, str]]:
-    """Tiles after these sessions, and why recordings add nothing."""
-    grower = GridGrower(before)
-    without = grow({"grid": grower}, sessions, StereoSettings())
-    return grower.tiles, without["grid"]
-
-
-def grown_surfels(before: SurfelTiles, sessions: Sequence[MappedSession]) -> tuple[SurfelTiles, dict[str, str]]:
-    """Surfels after these sessions, and why recordings add nothing."""
-    grower = SurfelGrower(before)
-    without = grow({"surfels": grower}, sessions, StereoSettings())
-    return grower.surfels, without["surfels"]
+def grown(grower: Any, session: MappedSession) -> tuple[Any, dict[str, str]]:
+    """A map that grows, after this session, and why its recording adds nothing."""
+    return grower, grow({"map": grower}, [session], StereoSettings())["map"]

@@ -11,8 +11,9 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.changes import APPEARED, VANISHED, SeenSite, changes_between
 from mapserver.plugins.dense_maps.surfel_map import Surfels, SurfelTiles
+from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT
-from support.storage.room_sessions import Seen, grown_surfels, ride, session_at
+from support.storage.room_sessions import Seen, grown, ride, session_at
 
 NONE = Surfels.joined([])
 PLACES = [place for place in ride([0.8] * 8)[2:6] for _ in range(2)]
@@ -42,7 +43,7 @@ def rooms() -> tuple[Surfels, Surfels, Surfels]:
     for number in range(3):
         session = session_at(PLACES, has_depth=True)
         session = with_board(session) if number == 1 else session
-        versions.append(grown_surfels(versions[-1], [session])[0])
+        versions.append(grown(SurfelGrower(versions[-1]), session)[0].surfels)
     bare, board, bare_again = (tiles.joined() for tiles in versions[1:])
     return bare, board, bare_again
 

@@ -15,35 +15,36 @@ from mapserver.plugins.dense_maps.expected_view import expected_view, pinhole
 from mapserver.plugins.dense_maps.exposure import Sample, estimate_exposure, lens_factor
 from mapserver.plugins.dense_maps.site_grid import FREE as FREE_VIEWS
 from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
-from mapserver.plugins.dense_maps.survey_grid import DepthView, grow
+from mapserver.plugins.dense_maps.survey_grid import DepthView, GridGrower, grow
+from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
-from support.storage.room_sessions import CAMERA, Seen, grown_grid, grown_surfels, ride, session_at
+from support.storage.room_sessions import CAMERA, Seen, grown, ride, session_at
 from support.worlds.box_room import ROOM_M, stereo_pair
 
 NONE = SurfelTiles()
 PLACES = ride([0.8] * 16)
 
 
-def grown(session: MappedSession, before: SurfelTiles = NONE) -> SurfelTiles:
-    surfels, without = grown_surfels(before, [session])
+def surfels(session: MappedSession, before: SurfelTiles = NONE) -> SurfelTiles:
+    grower, without = grown(SurfelGrower(before), session)
     assert without == {}
-    return surfels
+    return grower.surfels
 
 
 @pytest.mark.parametrize("has_depth", [False, True])
 def test_a_room_is_shown_as_a_frame_that_was_left_out_saw_it(has_depth: bool) -> None:
     kept = [place for i, place in enumerate(PLACES) if i != 7]
-    tiles = grown(session_at(kept, has_depth=has_depth))
-    surfels = tiles.joined()
-    off = np.abs(surfels.points_map[:, None] - ROOM_M).min(axis=(1, 2))
+    tiles = surfels(session_at(kept, has_depth=has_depth))
+    shown = tiles.joined()
+    off = np.abs(shown.points_map[:, None] - ROOM_M).min(axis=(1, 2))
     assert (off < 0.1).mean() > 0.97
     picture = stereo_pair(PLACES[7], 0).left.astype(float)
-    view = expected_view(surfels, pinhole(CAMERA), PLACES[7] @ BODY_FROM_CAM0)
+    view = expected_view(shown, pinhole(CAMERA), PLACES[7] @ BODY_FROM_CAM0)
     assert view.unknown.mean() < 0.2
     error = (view.picture - picture)[~view.unknown]
     flat = (picture - picture.mean())[~view.unknown]
     assert (error**2).mean() < 0.1 * (flat**2).mean()
-    assert tiles.blobs() == grown(session_at(kept, has_depth=has_depth)).blobs()
+    assert tiles.blobs() == surfels(session_at(kept, has_depth=has_depth)).blobs()
 
 
 def with_box(session: MappedSession, shown: range) -> MappedSession:
@@ -63,19 +64,19 @@ def in_the_way(surfels: SurfelTiles) -> int:
 
 def test_what_later_views_see_through_is_gone_and_what_stands_stays() -> None:
     there = [PLACES[4]] * 12
-    assert in_the_way(grown(with_box(session_at(there, has_depth=True), range(3)))) == 0
-    assert in_the_way(grown(with_box(session_at(there, has_depth=True), range(12)))) > 300
+    assert in_the_way(surfels(with_box(session_at(there, has_depth=True), range(3)))) == 0
+    assert in_the_way(surfels(with_box(session_at(there, has_depth=True), range(12)))) > 300
 
 
 def test_a_later_drive_takes_away_what_is_gone_and_keeps_what_it_does_not_see() -> None:
     there = [PLACES[4]] * 6
-    first = grown(with_box(session_at(there, has_depth=True), range(6)))
+    first = surfels(with_box(session_at(there, has_depth=True), range(6)))
     assert in_the_way(first) > 300
-    assert in_the_way(grown(session_at(there, has_depth=True), first)) == 0
+    assert in_the_way(surfels(session_at(there, has_depth=True), first)) == 0
     away = [place.copy() for place in there]
     for place in away:
         place[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ place[:3, :3]  # to the wall behind
-    both = grown(session_at(away, has_depth=True), first)
+    both = surfels(session_at(away, has_depth=True), first)
     assert in_the_way(both) == in_the_way(first)
     assert len(both) > len(first)
 
@@ -93,8 +94,8 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
         return session
 
     factors = np.exp(np.cumsum(rng.normal(0, 0.05, 12))) * 0.7
-    first = grown(exposed(factors))
-    second = grown(exposed(factors * 0.5), first)
+    first = surfels(exposed(factors))
+    second = surfels(exposed(factors * 0.5), first)
     plain = stereo_pair(PLACES[6], 0).left
     for tiles, factor in ((first, factors[6]), (second, 0.5 * factors[6])):
         view = expected_view(tiles.joined(), pinhole(CAMERA), PLACES[6] @ BODY_FROM_CAM0)
@@ -106,10 +107,14 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
 
 def test_one_camera_adds_nothing_and_says_so() -> None:
     mono = session_at(PLACES[:3], StereoCamera(FOCAL, CAMERA.cx_px, CAMERA.cy_px, 0.0, WIDTH, HEIGHT))
-    first, (grid, _) = grown(session_at(PLACES[:4], has_depth=True)), grown_grid({}, [session_at(ride([0.8] * 6))])
-    for (after, without), before in ((grown_surfels(first, [mono]), first), (grown_grid(grid, [mono]), grid)):
-        assert after == before
-        assert "no depth" in without["ride"]
+    first, tiles = (
+        surfels(session_at(PLACES[:4], has_depth=True)),
+        grown(GridGrower({}), session_at(ride([0.8] * 6)))[0].tiles,
+    )
+    for grower in (SurfelGrower(first), GridGrower(tiles)):
+        assert "no depth" in grown(grower, mono)[1]["ride"]
+        assert getattr(grower, "surfels", first) == first
+        assert getattr(grower, "tiles", tiles) == tiles
 
 
 def test_exposure_and_lens_are_told_apart() -> None:
@@ -135,9 +140,9 @@ def test_exposure_and_lens_are_told_apart() -> None:
 
 @pytest.mark.parametrize("has_depth", [False, True])
 def test_a_room_has_its_walls_and_nothing_behind_them(has_depth: bool) -> None:
-    tiles, without = grown_grid({}, [session_at(ride([0.8] * 12), has_depth=has_depth)])
+    grower, without = grown(GridGrower({}), session_at(ride([0.8] * 12), has_depth=has_depth))
     assert without == {}
-    grid = occupancy(tiles, 1.1)
+    grid = occupancy(grower.tiles, 1.1)
     rows, _ = np.nonzero(grid.cells == OCCUPIED)
     y = grid.map_from_grid[1, 3] + (rows + 0.5) * CELL_M
     assert len(rows) > 20
@@ -146,12 +151,12 @@ def test_a_room_has_its_walls_and_nothing_behind_them(has_depth: bool) -> None:
     assert len(free_rows) > 500
     assert grid.map_from_grid[1, 3] + (free_rows.max() + 1) * CELL_M < ROOM_M[1, 1] + CELL_M
     assert (grid.cells[rows.max() + 2 :] == UNKNOWN).all()
-    again, _ = grown_grid({}, [session_at(ride([0.8] * 12), has_depth=has_depth)])
-    assert all(np.array_equal(cells, again[place]) for place, cells in tiles.items())
+    again, _ = grown(GridGrower({}), session_at(ride([0.8] * 12), has_depth=has_depth))
+    assert all(np.array_equal(cells, again.tiles[place]) for place, cells in grower.tiles.items())
 
 
 def test_a_camera_that_is_carried_by_hand_has_no_floor() -> None:
-    _, without = grown_grid({}, [session_at(ride([0.6, 0.75, 0.9, 1.05, 1.2, 1.35]))])
+    _, without = grown(GridGrower({}), session_at(ride([0.6, 0.75, 0.9, 1.05, 1.2, 1.35])))
     assert "carried by hand" in without["ride"]
 
 
