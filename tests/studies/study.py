@@ -97,13 +97,8 @@ def _made(cases: Mapping[str, Callable[[], Row]], jobs: int) -> Iterator[Row]:
 
 def _timed(case: str, make: Callable[[], Row]) -> Row:
     """The row of a case, with its name and what it took."""
-    begin_s = _cpu_s()
-    return {"case": case, **make(), "cpu_s": round(_cpu_s() - begin_s, 2)}
-
-
-def _cpu_s() -> float:
-    """Of this process and of those that it waited for."""
-    return sum(os.times()[:4])
+    begin_s = sum(os.times()[:4])  # of this process and of those that it waited for
+    return {"case": case, **make(), "cpu_s": round(sum(os.times()[:4]) - begin_s, 2)}
 
 
 def environment(name: str, *wheels: str) -> Path:

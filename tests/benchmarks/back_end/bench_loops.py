@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
 from fleetmap.bow.vocabulary import default_vocabulary
-from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.geometry import se3_inverse, se3_log
 from fleetmap.sensors.samples import SensorSet
 from mapserver.config import survey_settings
 from mapserver.survey.loops.loops import LoopCloser
@@ -52,13 +52,11 @@ def accepted(survey: SimulatedSurvey) -> list[Loop]:
         true = se3_inverse(truth[edge.i]) @ truth[edge.j]
         placed = closer._marginals.map_from_body
         predicted = se3_inverse(placed[edge.i]) @ placed[edge.j]
-        off, off_gate = (se3_log(true @ se3_inverse(each)) for each in (edge.i_from_j, predicted))
-        gate = closer._marginals.relative_cov(edge.i, edge.j)
-        found[edge.i, edge.j] = Loop(
-            _squared(off, edge.cov_rot_trans),
-            _squared(off_gate, gate),
-            float(np.linalg.norm((true - edge.i_from_j)[:3, 3])),
-        )
+        gate, squared = closer._marginals.relative_cov(edge.i, edge.j), list[float]()
+        for each, covariance in ((edge.i_from_j, edge.cov_rot_trans), (predicted, gate)):
+            off = se3_log(true @ se3_inverse(each))
+            squared.append(float(off @ np.linalg.solve(covariance, off)))
+        found[edge.i, edge.j] = Loop(*squared, float(np.linalg.norm((true - edge.i_from_j)[:3, 3])))
         accept(closer, edge)
 
     tools = SurveyTools()
@@ -66,10 +64,6 @@ def accepted(survey: SimulatedSurvey) -> list[Loop]:
         chain = adjust_chain(survey.odometry, survey.inputs, SETTINGS, tools)
         _, loops = close_loops(chain, survey.inputs, SurveyConfig(SETTINGS, default_vocabulary()), tools)
     return [found[edge.i, edge.j] for edge in loops.edges]
-
-
-def _squared(off: Array, covariance: Array) -> float:
-    return float(off @ np.linalg.solve(covariance, off))
 
 
 def surveys(first: int) -> Iterator[list[Loop]]:

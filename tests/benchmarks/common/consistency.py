@@ -86,24 +86,18 @@ def figures(session: EstimatorSession, estimates: list[OdometryEstimate], inerti
     first = next(k for k, e in enumerate(estimates) if e.inertial) if inertial else 0
     odom_from_map = _odom_from_map(estimates[first].odom_from_body, session.map_from_body[first], inertial)
     truth = odom_from_map @ session.map_from_body
-    turns, shifts, squares = [], [], []
+    every, squares = [], []
     for k in range(first + 1, len(estimates)):
         estimate, covariance = estimates[k].odom_from_body, estimates[k].cov_rot_trans
-        turn = so3_log(truth[k, :3, :3] @ estimate[:3, :3].T)
-        shift = truth[k, :3, 3] - estimate[:3, 3]
-        squares.append(
-            (
-                turn @ np.linalg.solve(covariance[:3, :3], turn) / 3,
-                shift @ np.linalg.solve(covariance[3:, 3:], shift) / 3,
-            )
-        )
-        turns.append(turn)
-        shifts.append(shift)
+        every.append((so3_log(truth[k, :3, :3] @ estimate[:3, :3].T), truth[k, :3, 3] - estimate[:3, 3]))
+        blocks = zip(every[-1], (covariance[:3, :3], covariance[3:, 3:]), strict=True)
+        squares.append([off @ np.linalg.solve(block, off) / 3 for off, block in blocks])
     rotation, position = np.array(squares).mean(axis=0)
+    rms = np.sqrt(np.square(every).sum(axis=2).mean(axis=0)).tolist()
     way = np.linalg.norm(np.diff(truth[first : len(estimates), :3, 3], axis=0), axis=1).sum()
     return Figures(
-        float(rotation), float(position), _rms(np.array(turns)), _rms(np.array(shifts)), float(np.linalg.norm(shifts[-1])),
-        float(way), float(np.mean([e.inlier_share for e in estimates[first:]])),
+        float(rotation), float(position), *rms, float(np.linalg.norm(every[-1][1])), float(way),
+        float(np.mean([e.inlier_share for e in estimates[first:]])),
     )  # fmt: skip
 
 
@@ -134,10 +128,6 @@ def with_frozen_gyro(session: EstimatorSession, starts_s: Array, duration_s: flo
         frozen = np.flatnonzero((times_s >= start_s) & (times_s < start_s + duration_s))
         gyro_radps[frozen] = gyro_radps[frozen[0]]
     return EstimatorSession(replace(session.session, imu=replace(imu, gyro_radps=gyro_radps)), field=session._field)
-
-
-def _rms(errors: Array) -> float:
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
 def _odom_from_map(odom_from_body: Array, map_from_body: Array, inertial: bool) -> Array:

@@ -42,12 +42,8 @@ def _mark(mask: Mask, faces: Faces, robot_height_m: float) -> None:
         _set(mask, points.reshape(-1, 3))
     for x, y, z, half_x, half_y, half_z, cosine, sine in faces.boxes[:, :8]:
         if z + half_z > FLOOR_M and z - half_z < robot_height_m:
-            a, b = np.meshgrid(_span(half_x), _span(half_y))
+            a, b = np.meshgrid(*(np.linspace(-half, half, int(2 * half / 0.02) + 2) for half in (half_x, half_y)))
             _set(mask, np.stack([x + cosine * a - sine * b, y + sine * a + cosine * b], axis=-1).reshape(-1, 2))
-
-
-def _span(half_m: float) -> Array:
-    return np.linspace(-half_m, half_m, int(2 * half_m / 0.02) + 2)
 
 
 def _set(mask: Mask, points: Array) -> None:

@@ -55,11 +55,6 @@ def blocks() -> Scenario:
     return Scenario("nine aisles in four drives", layout, runs)
 
 
-def recorded(seed: int, n: int, work: Path) -> Path:
-    """The recording of a drive."""
-    return rendered(work / f"blocks-{seed}-{n}.mcap", Order("blocks", seed, robot=f"drive-{n}"), blocks())
-
-
 def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> survey_recordings.RecordingSurvey:
     """The survey of a recording's frames, without a store."""
     reading = survey_recordings.OpenRecordings(survey_recordings.RecordingOptions(frames), path.parent)
@@ -148,8 +143,11 @@ def main(given: Options) -> Results:
     figures = {}
     for name in given.only:
         surveys = list[survey_recordings.RecordingSurvey]()
-        parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
-        for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
+        parts = [(DATA / name, f"{half}::2") for half in range(2)]
+        if name == "drives":
+            orders = [Order("blocks", given.seed, robot=f"drive-{n}") for n in range(DRIVES)]
+            parts = [(rendered(given.work / f"blocks-{o.seed}-{o.robot}.mcap", o, blocks()), "::") for o in orders]
+        for path, frames in parts:
             surveys.append(surveyed(path, frames, surveys[0].survey.state.rig.camera if surveys else None))
         figures[name] = joined(surveys)
     return figures

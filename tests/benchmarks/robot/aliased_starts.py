@@ -130,20 +130,13 @@ def ways_m(session: EstimatorSession) -> Array:
     return way - way[int(np.argmax(is_outside))] if is_outside.any() else way - way[-1]
 
 
-def is_wrong(estimate: Estimate, truth: Array) -> bool:
-    """TRACKING somewhere else."""
-    if estimate.status is not Status.TRACKING or estimate.map_from_body is None:
-        return False
-    return bool(np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) > WRONG_M)
-
-
 def judged(frame: int, session: EstimatorSession, estimates: list[Estimate]) -> Start:
     """The start's outcome."""
     wrong = ambiguous = with_right = 0
     first: int | None = None
     for number, (estimate, truth) in enumerate(zip(estimates, session.map_from_body, strict=False)):
         if estimate.status is Status.TRACKING:
-            off = is_wrong(estimate, truth)
+            off = bool(np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) > WRONG_M)
             wrong += off
             first = number if first is None and not off else first
         elif estimate.status is Status.AMBIGUOUS:

@@ -19,14 +19,7 @@ from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import PositionPrior, wheel_between
 from fleetmap.sources.source import ReplaySource
 from locclient.replay.run_result import ReplayResult
-from support.recordings.calibration_faults import (
-    AXES,
-    another_robots_file,
-    mirrored,
-    standard_faults,
-    swapped,
-    unlike_robot,
-)
+from support.recordings.calibration_faults import AXES, RigFault, mirrored, standard_faults, swapped, unlike_robot
 
 GOOD = "none"
 _WATCHED_S, _GOOD_S = 30.0, 15.0
@@ -76,8 +69,8 @@ class Outcome(NamedTuple):
 
 def faults(recording: Recording) -> dict[str, Recording]:
     """The recording with each fault, by name."""
-    rig = recording.calibration
-    rig_faults = [*standard_faults(), another_robots_file(unlike_robot(rig, int(_SEED)))]
+    others = unlike_robot(recording.calibration, int(_SEED))
+    rig_faults = [*standard_faults(), RigFault("another robot's file", 1.0, "file", lambda _: others)]
     found = {GOOD: recording}
     found |= {fault.name: fault.recording(recording) for fault in rig_faults}
     return found | {"swapped": swapped(recording), "mirrored": mirrored(recording)}

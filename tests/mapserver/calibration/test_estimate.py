@@ -11,7 +11,7 @@ from mapserver.calibration import CalibrationEstimate, CalibrationParameter
 from mapserver.calibration.estimate import estimate_from
 from mapserver.calibration.image_rows import Observations
 from mapserver.calibration.parameters import COLUMNS, DISTORTION, INDEX, UNKNOWNS, corrected_rig
-from support.worlds.calibration_scene import Stretch, make_stretch, measured, with_errors, zero_theta
+from support.worlds.calibration_scene import Stretch, make_stretch, measured, with_errors
 
 P = CalibrationParameter
 # What a calibration may be off by: each at least ten sigmas of what a loop of half a minute shows.
@@ -43,7 +43,7 @@ def straight() -> Stretch:
 
 
 def estimated(stretch: Stretch, errors: dict[P, float], seed: int = 1, **sensors: bool) -> CalibrationEstimate:
-    theta = zero_theta()
+    theta = np.zeros(len(COLUMNS))
     for name, value in errors.items():
         theta[INDEX[name]] = value
     return estimate_from([measured(stretch, with_errors(stretch.session.true, theta), seed, **sensors)])

@@ -16,7 +16,6 @@ from PIL import Image
 
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
-from fleetmap.mapformat.manifest import Manifest
 from fleetmap.version_grid import OccupancyGrid
 from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers
@@ -106,17 +105,13 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
 
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
-    empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
+    empty = make_plan(msgspec.structs.replace(manifest, tiles=()), lambda _: pytest.fail("there is none"))
     assert empty.box == (-5.0, -5.0, 5.0, 5.0)
     (tile,) = (tile for tile in hall_tiles() if (tile.tile_x, tile.tile_y) == (0, 0))
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
-    alone = make_plan(_with_tiles(manifest, (entry,)), lambda _: bare)
+    alone = make_plan(msgspec.structs.replace(manifest, tiles=(entry,)), lambda _: bare)
     assert (alone.box, alone.places) == ((0.0, 0.0, 16.0, 16.0), 0)
-
-
-def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
-    return msgspec.structs.replace(manifest, tiles=tiles)
 
 
 def test_a_map_has_its_layers(store: MapStore) -> None:

@@ -14,21 +14,16 @@ from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.evaluation.trajectory_error import accuracy
-from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
 NEW_FROM_MAP = se3_exp(np.array([0.4, -1.2, 2.0, 3.0, -7.0, 1.0]))
 
 
-def seen(survey: SurveyMap) -> np.ndarray:
-    """(K, N, 3) all landmarks from all keyframes' bodies."""
-    return np.array([transform_points(se3_inverse(body), survey.points_map) for body in survey.map_from_body])
-
-
 def test_moving_a_survey_changes_nothing_that_was_measured() -> None:
     survey = random_survey(np.random.default_rng(1))
     there = survey.transformed(NEW_FROM_MAP)
-    np.testing.assert_allclose(seen(there), seen(survey), atol=1e-9)
+    seen = [[transform_points(se3_inverse(body), s.points_map) for body in s.map_from_body] for s in (there, survey)]
+    np.testing.assert_allclose(*seen, atol=1e-9)
     np.testing.assert_allclose(there.map_from_body[0], NEW_FROM_MAP @ survey.map_from_body[0], atol=1e-12)
     np.testing.assert_allclose(there.trajectory.frame_from_body, there.map_from_body, atol=1e-12)
     back = there.transformed(se3_inverse(NEW_FROM_MAP))

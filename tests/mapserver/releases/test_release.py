@@ -13,14 +13,10 @@ from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, RigEv
 from mapserver.quality.gate import GateSettings
 from mapserver.releases.version_diff import SideBySide
 from mapserver.store import Actor, DraftContent, MapStore
-from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
+from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft, states
 
 ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000
-
-
-def states(store: MapStore) -> dict[int, str]:
-    return {info.version: info.state for info in store.versions("lab")}
 
 
 def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from mapserver import releases
 from mapserver.store import Actor, MapStore, Retention, chain_faults
 from mapserver.store.places import read_places
 from support.storage.clock import Clock
-from support.storage.map_samples import publish_samples, save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft, states
 from support.storage.s3_server import Content
 
 ADA = Actor("ada", "a test")
@@ -26,10 +26,6 @@ DAY_NS = 86_400_000_000_000
 def store(store_folder: Path, clock: Clock):
     with MapStore.open(store_folder, create=True, clock_ns=clock) as opened:
         yield opened
-
-
-def states(store: MapStore) -> dict[int, str]:
-    return {info.version: info.state for info in store.versions("lab")}
 
 
 def test_the_log_is_never_changed(store: MapStore) -> None:

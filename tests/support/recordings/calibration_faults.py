@@ -12,7 +12,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredImage, decode_grey, png_image
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -65,7 +65,7 @@ def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
 
 def pair_turn(axis: str, degrees: float) -> RigFault:
     """A wrong rotation of the right camera against the left one (a key of AXES, the right camera's own axes)."""
-    turn = se3(_rotation(AXES[axis], degrees), np.zeros(3))
+    turn = se3(so3_exp(np.radians(degrees) * np.array(AXES[axis])), np.zeros(3))
     turned = partial(_with_cameras, lambda c: replace(c, body_from_cam=c.body_from_cam @ turn), {1})
     return RigFault(f"pair {axis}", degrees, "deg", turned)
 
@@ -75,7 +75,7 @@ def camera_imu_turn(axis: str, degrees: float) -> RigFault:
 
     def change(rig: RigCalibration) -> RigCalibration:
         axes = rig.cameras[0].body_from_cam[:3, :3]
-        turn = axes @ _rotation(AXES[axis], degrees) @ axes.T
+        turn = axes @ so3_exp(np.radians(degrees) * np.array(AXES[axis])) @ axes.T
         centre = rig.cameras[0].body_from_cam[:3, 3]
         about_left = se3(turn, centre - turn @ centre)
         return _with_cameras(lambda c: replace(c, body_from_cam=about_left @ c.body_from_cam), None, rig)
@@ -87,11 +87,6 @@ def delay(milliseconds: float) -> RigFault:
     """A wrong delay of the IMU's stamps against the cameras'."""
     late = partial(_with_cameras, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
     return RigFault("delay", milliseconds, "ms", late)
-
-
-def another_robots_file(rig: RigCalibration) -> RigFault:
-    """The calibration file of another robot whose images have the same size."""
-    return RigFault("another robot's file", 1.0, "file", lambda _: rig)
 
 
 def unlike_robot(rig: RigCalibration, seed: int) -> RigCalibration:
@@ -138,10 +133,6 @@ def mirrored(good: Recording) -> Recording:
 
     every = np.arange(len(good))
     return with_frames(good, every, lambda frame: replace(frame, left=flipped(frame.left), right=flipped(frame.right)))
-
-
-def _rotation(axis: tuple[float, float, float], degrees: float) -> Array:
-    return so3_exp(np.radians(degrees) * np.array(axis))
 
 
 def _with_cameras(

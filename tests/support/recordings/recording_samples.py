@@ -5,7 +5,7 @@ A textured wall 5 m before a stereo pair that turns about all three axes; nothin
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -111,20 +111,21 @@ def write_euroc(folder: Path, sample: Sample, *, image_type: str = "png", yaml_l
     )
     truth = folder / "mav0/state_groundtruth_estimate0"
     truth.mkdir()
-    rows = ["#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,v,v,v,bw,bw,bw,ba,ba,ba"]
-    for stamp, world_from_body in zip(sample.stamps_ns, sample.world_from_body, strict=True):
-        values = [*world_from_body[:3, 3], *quat_wxyz_from_rotation(world_from_body[:3, :3]), *np.zeros(9)]
-        rows.append(",".join([str(stamp), *(repr(float(v)) for v in values)]))
-    (truth / "data.csv").write_text("\n".join(rows) + "\n")
+    head = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,v,v,v,bw,bw,bw,ba,ba,ba"
+    rows = [[*place[:3, 3], *quat_wxyz_from_rotation(place[:3, :3]), *np.zeros(9)] for place in sample.world_from_body]
+    (truth / "data.csv").write_text(_rows(head, ",", sample.stamps_ns, rows) + "\n")
     return folder
 
 
 def write_euroc_imu(file: Path, stamps_ns: NDArray[np.int64], gyro_radps: Array, accel_mps2: Array) -> None:
     """A EuRoC imu0/data.csv."""
-    rows = ["#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z"]
-    for stamp, gyro, accel in zip(stamps_ns, gyro_radps, accel_mps2, strict=True):
-        rows.append(",".join([str(stamp), *(repr(float(v)) for v in (*gyro, *accel))]))
-    file.write_text("\n".join(rows) + "\n")
+    head, values = "#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", np.hstack([gyro_radps, accel_mps2])
+    file.write_text(_rows(head, ",", stamps_ns, values) + "\n")
+
+
+def _rows(head: str, between: str, stamps: Iterable[object], values: Iterable[Sequence[float]]) -> str:
+    rows = zip(stamps, values, strict=True)
+    return "\n".join([head, *(between.join([str(stamp), *(repr(float(v)) for v in row)]) for stamp, row in rows)])
 
 
 def write_tumvi(folder: Path, sample: Sample) -> Path:
@@ -141,15 +142,10 @@ def write_tumvi(folder: Path, sample: Sample) -> Path:
         "rostopic: /imu0\nupdate_rate: 200.0\naccelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
         "gyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-5\n"
     )
-    rows = ["# timestamp[ns] w.x w.y w.z a.x a.y a.z"]
-    for stamp, gyro, accel in zip(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2, strict=True):
-        rows.append(" ".join([str(stamp), *(repr(float(v)) for v in (*gyro, *accel))]))
-    (folder / "imu.txt").write_text("\n".join(rows))
-    rows = ["# timestamp[ns],tx,ty,tz,qw,qx,qy,qz"]
-    for stamp, world_from_body in zip(sample.stamps_ns, sample.world_from_body, strict=True):
-        values = [*world_from_body[:3, 3], *quat_wxyz_from_rotation(world_from_body[:3, :3])]
-        rows.append(",".join([str(stamp), *(repr(float(v)) for v in values)]))
-    (folder / "gt_imu.csv").write_text("\n".join(rows))
+    felt = np.hstack([sample.gyro_radps, sample.accel_mps2])
+    (folder / "imu.txt").write_text(_rows("# timestamp[ns] w.x w.y w.z a.x a.y a.z", " ", sample.imu_stamps_ns, felt))
+    rows = [[*place[:3, 3], *quat_wxyz_from_rotation(place[:3, :3])] for place in sample.world_from_body]
+    (folder / "gt_imu.csv").write_text(_rows("# timestamp[ns],tx,ty,tz,qw,qx,qy,qz", ",", sample.stamps_ns, rows))
     return folder
 
 
@@ -214,13 +210,10 @@ def write_tum_rgbd(folder: Path, sample: Sample) -> Path:
             lists[name].append(f"{text} {name}/{text}.png")
     for name, rows in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
-    rows = ["# timestamp tx ty tz qx qy qz qw"]
-    for stamp in sample.stamps_ns.tolist():
-        place = world_from_cam0(stamp)
-        w, *xyz = quat_wxyz_from_rotation(place[:3, :3])
-        numbers = " ".join(repr(float(v)) for v in (*place[:3, 3], *xyz, w))
-        rows.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}")
-    (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    places = [world_from_cam0(stamp) for stamp in sample.stamps_ns.tolist()]
+    rows = [[*at[:3, 3], *np.roll(quat_wxyz_from_rotation(at[:3, :3]), -1)] for at in places]
+    stamps = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in sample.stamps_ns.tolist()]
+    (folder / "groundtruth.txt").write_text(_rows("# timestamp tx ty tz qx qy qz qw", " ", stamps, rows) + "\n")
     return folder
 
 

@@ -181,3 +181,8 @@ def publish_samples(store: MapStore, count: int, *, first: int = 0, site: str = 
     for seed in range(first, first + count):
         save_sample_draft(store, site=site, seed=seed)
         releases.publish(store, site)
+
+
+def states(store: MapStore) -> dict[int, str]:
+    """Of the versions of site lab."""
+    return {info.version: info.state for info in store.versions("lab")}

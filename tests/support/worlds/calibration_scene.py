@@ -106,11 +106,6 @@ def _rectified(rectifier: Rectifier, rig: RigCalibration, raw_px: Array, number:
     return rays[:, :2] / rays[:, 2:] * pinhole.focal_px + [pinhole.cx_px, pinhole.cy_px]
 
 
-def zero_theta() -> Array:
-    """(C,) no correction."""
-    return np.zeros(len(COLUMNS))
-
-
 def estimate(*, unknown: dict[CalibrationParameter, str] | None = None, **off: float) -> CalibrationEstimate:
     """All parameters right to a tenth of their limit, but for those that are off, by name of the member, and those that nothing shows."""
     sigmas = np.array([0.1 * p.warn_above for p in COLUMNS])

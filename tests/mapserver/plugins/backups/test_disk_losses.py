@@ -115,7 +115,8 @@ def lose_disks(tmp_path: Path, robots: int, losses: int) -> None:
         elif what < 0.7:
             told = set[str]().union(*(robot.acknowledged for robot in fleet))
             server.lose_disk()
-            lost, unknown = lost + 1, unknown + len(told - stored(server))
+            there = {row.failure_id for row in server.store.fleet.failures(FailureFilter(site=SITE))}
+            lost, unknown = lost + 1, unknown + len(told - there)
     for _ in range(25):
         clock.now_ns += 4 * HOUR_NS
         update_lists(server.store)
@@ -129,7 +130,3 @@ def lose_disks(tmp_path: Path, robots: int, losses: int) -> None:
     assert len(rows) == len({row.failure_id for row in rows})
     assert {row.failure_id for row in rows} == set[str]().union(*(robot.failed for robot in fleet))
     assert server.store.verify().faults == []
-
-
-def stored(server: Server) -> set[str]:
-    return {row.failure_id for row in server.store.fleet.failures(FailureFilter(site=SITE))}

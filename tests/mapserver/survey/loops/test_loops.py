@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from msgspec import structs
 
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_points
@@ -29,18 +28,18 @@ from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = SurveySettings(loops=LoopSettings(min_gap_keyframes=6))
 WALL, AGAIN = range(4), range(10, 14)
+PLACES = np.array(
+    [out_and_back(6.0, yaw_rad=yaw)(2.0 + 0.2 * n) for yaw, count in ((np.pi / 2, 4), (-1.2, 6)) for n in range(count)]
+)
 
 
 @lru_cache(maxsize=1)
-def seen() -> tuple[list[Keyframe], Array, Rectifier, Vocabulary]:
-    """Ten rendered keyframes, where each was, the rig and a vocabulary."""
-    wall = [out_and_back(6.0)(t) for t in (2.0, 2.2, 2.4, 2.6)]
-    other = [out_and_back(6.0, yaw_rad=-1.2)(t) for t in (2.0, 2.2, 2.4, 2.6, 2.8, 3.0)]
-    places = np.array([*wall, *other])
-    keyframes, rectifier = rendered_keyframes(places, SETTINGS, 10**9)
+def seen() -> tuple[list[Keyframe], Rectifier, Vocabulary]:
+    """Keyframes rendered at ten places, the rig and a vocabulary."""
+    keyframes, rectifier = rendered_keyframes(PLACES, SETTINGS, 10**9)
     descriptors = np.concatenate([k.features.descriptors for k in keyframes])
     images = np.repeat(np.arange(len(keyframes)), [len(k.features) for k in keyframes])
-    return keyframes, places, rectifier, train_vocabulary(descriptors, 8, 3, np.random.default_rng(2), images)
+    return keyframes, rectifier, train_vocabulary(descriptors, 8, 3, np.random.default_rng(2), images)
 
 
 def closed(
@@ -50,8 +49,7 @@ def closed(
 
     sigma_m: of the whole way from keyframe 0 to the last one.
     """
-    _, places, _, _ = seen()
-    path = np.array([*places, *places[WALL]])
+    path = np.array([*PLACES, *PLACES[WALL]])
     path[10:, :3, 3] += believed_shift_m
     steps = len(path) - 1
     sigmas = [sigma_m / np.sqrt(steps)] * steps
@@ -72,7 +70,7 @@ def looked(
 
     sigmas: in metres, of each step. only_words: of the drive's keyframes, those that see the same features all over the picture.
     """
-    keyframes, _, rectifier, vocabulary = seen()
+    keyframes, rectifier, vocabulary = seen()
     whole = [replace(keyframes[k], frame_index=n) for n, k in enumerate(order)]
     for n in only_words:
         features = whole[n].features
@@ -92,10 +90,6 @@ def looked(
     return replace(closer.loops, doubted=closer.doubted())
 
 
-def replace_loops(settings: SurveySettings, **changes: float) -> SurveySettings:
-    return structs.replace(settings, loops=structs.replace(settings.loops, **changes))
-
-
 def wall_records(loops: Loops) -> list[LoopRecord]:
     every = [replace(r, j=j, also=()) for r in loops.records for j in (r.j, *r.also)]
     return [r for r in every if r.i in AGAIN and r.j in WALL]
@@ -104,7 +98,6 @@ def wall_records(loops: Loops) -> list[LoopRecord]:
 def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
     """0.3 m of drift, a sigma of 0.3 m: same pictures, so the true motion between copies is none at all."""
     loops = closed(np.array([0.2, -0.2, 0.1]), 0.3)
-    _, places, _, _ = seen()
     accepted = {(e.i, e.j): e for e in loops.edges}
     for k in WALL:
         edge = accepted[10 + k, k]
@@ -112,7 +105,7 @@ def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
         assert edge.is_loop
         assert np.linalg.eigvalsh(edge.cov_rot_trans)[0] > 0
     for (i, j), edge in accepted.items():
-        truth = se3_inverse(places[i - 10]) @ places[j]
+        truth = se3_inverse(PLACES[i - 10]) @ PLACES[j]
         assert np.linalg.norm((se3_inverse(truth) @ edge.i_from_j)[:3, 3]) < 0.03
     assert set(accepted) <= {(i, j) for i in AGAIN for j in WALL}
 
@@ -145,15 +138,14 @@ def test_where_people_say_that_the_site_repeats_a_first_alias_is_not_believed(
     sigma_m: float, verdict: LoopVerdict
 ) -> None:
     """Nothing in the survey looks like the wall but the wall itself; the next aisle, 1.5 m aside, may not have been seen yet."""
-    settings = replace_loops(SETTINGS, repeats_every_m=1.5)
+    settings = SurveySettings(loops=LoopSettings(min_gap_keyframes=6, repeats_every_m=1.5))
     loops = closed(np.array([0, 1.5 if sigma_m > 0.5 else 0.1, 0]), sigma_m, settings=settings)
     assert {r.verdict for r in wall_records(loops) if r.i - r.j == 10} == {verdict}
     assert bool(loops.edges) is (verdict is LoopVerdict.ACCEPTED)
 
 
 def test_zones_exclude_what_position_alone_would_admit() -> None:
-    _, places, _, _ = seen()
-    middle = places[0][1, 3] + 0.75
+    middle = PLACES[0][1, 3] + 0.75
     low = np.array([[-50, -50], [50, -50], [50, middle], [-50, middle]])
     high = np.array([[-50, middle], [50, middle], [50, 50], [-50, 50]])
     loops = closed(np.array([0, 1.5, 0]), 0.8, zones=Zones({"low": low, "high": high}))
@@ -166,13 +158,12 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
 
     Only two keyframes see the second one: no step of the site is learnt of it.
     """
-    _, places, _, _ = seen()
     shift = np.array([0, 1.6, 0])
-    moved = places[:2].copy()
+    moved = PLACES[:2].copy()
     moved[:, :3, 3] += shift
-    between = places[:4].copy()
+    between = PLACES[:4].copy()
     between[:, :3, 3] += 0.5 * shift
-    path = np.array([*places[:4], *places[4:10], *moved, *places[4:10], *between])
+    path = np.array([*PLACES[:4], *PLACES[4:10], *moved, *PLACES[4:10], *between])
     order = [*range(10), *range(2), *range(4, 10), *range(4)]
     sigmas = [0.005] * 11 + [0.5] * 10
     loops = looked(order, path, sigmas, 19)
@@ -196,9 +187,8 @@ def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(
     Only where the way there is known too well for that it is the first aisle. The same features in other places of the picture
     are no such aisle.
     """
-    _, places, _, _ = seen()
     aside = np.array([0, 8.0, 0])
-    path = np.array([*places, *places, *places[:4]])
+    path = np.array([*PLACES, *PLACES, *PLACES[:4]])
     path[10:14, :3, 3] += aside
     path[20:, :3, 3] -= 0.25 * aside
     sigmas = [0.005] * 19 + [sigma_m] + [0.005] * 3
@@ -210,11 +200,10 @@ def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(
 
 def test_what_gives_a_keyframe_the_same_place_is_no_alias() -> None:
     """Keyframes 0 and 2 see one wall, and count as places apart where views reach a centimetre; 1, between them, matches both."""
-    _, places, _, _ = seen()
     order = [0, *range(2, 10), 1]
-    path = places[order]
+    path = PLACES[order]
     path[9, :3, 3] += [0.2, -0.2, 0.1]
-    near = replace_loops(SETTINGS, view_range_depths=0.01)
+    near = SurveySettings(loops=LoopSettings(min_gap_keyframes=6, view_range_depths=0.01))
     loops = looked(order, path, [0.001] * 8 + [0.5], 10, settings=near)
     assert {(r.i, r.j) for r in loops.records if r.verdict is LoopVerdict.ACCEPTED} >= {(9, 0), (9, 1)}
 
@@ -222,9 +211,8 @@ def test_what_gives_a_keyframe_the_same_place_is_no_alias() -> None:
 @pytest.mark.parametrize(("sigma_m", "has_edge"), [(0.01, False), (0.2, True)])
 def test_what_odometry_knows_better_is_a_loop_without_an_edge(sigma_m: float, has_edge: bool) -> None:
     """Far matches measure a relative pose to decimetres along the view, and in aisles they are wrong by more: many would add up."""
-    _, places, _, _ = seen()
-    path = places[[*range(10), 1]]
-    far_enough = replace_loops(SETTINGS, view_range_depths=0.2)
+    path = PLACES[[*range(10), 1]]
+    far_enough = SurveySettings(loops=LoopSettings(min_gap_keyframes=6, view_range_depths=0.2))
     loops = looked([*range(10), 1], path, [0.001] * 9 + [sigma_m], 11, settings=far_enough)
     assert bool(loops.edges) is has_edge
     assert loops.counts()["accepted"]
@@ -236,9 +224,8 @@ def test_a_step_of_the_site_is_learnt_where_it_is_seen_and_counts_everywhere(twi
 
     Two keyframes are not enough for it: one of them may have matched by chance.
     """
-    _, places, _, _ = seen()
     aside = np.array([0, 1.9, 0])
-    path = np.array([*places, *places[:twins], *places[4:8]])
+    path = np.array([*PLACES, *PLACES[:twins], *PLACES[4:8]])
     path[10 : 10 + twins, :3, 3] += aside
     path[10 + twins :, :3, 3] += 0.4 * aside
     order = [*range(10), *range(twins), *range(4, 8)]
@@ -259,8 +246,7 @@ def test_motion_that_no_picture_shows_is_doubted_where_matches_agree_against_it(
     dark: int | None, aside_m: float, returns: int, doubted: tuple[int, ...]
 ) -> None:
     """Six places are met again aside of where they can be: the way there is wrong, or they look the same. Pictures and a return tell."""
-    _, places, _, _ = seen()
-    path = np.array([*places, *places[4:], *places[:returns]])
+    path = np.array([*PLACES, *PLACES[4:], *PLACES[:returns]])
     path[10:16, 1, 3] += aside_m
     pieces = KeyframeGroups([(k, k + 1) for k in range(len(path) - 1) if k != dark], len(path))
     order = [*range(10), *range(4, 10), *range(returns)]
@@ -269,28 +255,21 @@ def test_motion_that_no_picture_shows_is_doubted_where_matches_agree_against_it(
     assert all(e.i >= 16 for e in loops.edges)
 
 
-def edge(i: int, j: int) -> PoseEdge:
-    return PoseEdge(i, j, se3_exp(np.zeros(6)), np.eye(6), is_loop=True)
-
-
-def record(i: int, j: int, verdict: LoopVerdict) -> LoopRecord:
-    return LoopRecord(i, j, 0.5, verdict, "because", 40)
-
-
 def test_counts_add_up() -> None:
     verdicts = (
         [LoopVerdict.ACCEPTED] * 3 + [LoopVerdict.GATED_OUT] * 2 + [LoopVerdict.REJECTED] + [LoopVerdict.AMBIGUOUS] * 4
     )
     together = LoopRecord(20, 1, 0.5, LoopVerdict.GATED_OUT, "because", also=(2, 3))
-    loops = Loops([together, *(record(20 + k, k, verdict) for k, verdict in enumerate(verdicts))])
+    loops = Loops([together, *(LoopRecord(20 + k, k, 0.5, verdict, "") for k, verdict in enumerate(verdicts))])
     assert loops.counts() == {"candidates": 13, "gated_out": 5, "rejected": 5, "accepted": 3}
     assert Loops().counts() == {"candidates": 0, "gated_out": 0, "rejected": 0, "accepted": 0}
 
 
 def test_what_the_pose_graph_disbelieves_is_rejected_after_all() -> None:
     accepted, gated_out = LoopVerdict.ACCEPTED, LoopVerdict.GATED_OUT
-    records = [record(20, 1, accepted), record(20, 2, gated_out), record(21, 1, accepted)]
-    loops = Loops(records, [edge(20, 1), edge(21, 1)])
+    judged = ((20, 1, accepted), (20, 2, gated_out), (21, 1, accepted))
+    records = [LoopRecord(i, j, 0.5, verdict, "because", 40) for i, j, verdict in judged]
+    loops = Loops(records, [PoseEdge(i, 1, np.eye(4), np.eye(6), is_loop=True) for i in (20, 21)])
     loops = loops.without_outliers(np.array([0.49, 0.51]))
     assert [(e.i, e.j) for e in loops.edges] == [(21, 1)]
     assert [r.verdict for r in loops.records] == [LoopVerdict.REJECTED, LoopVerdict.GATED_OUT, LoopVerdict.ACCEPTED]

@@ -114,11 +114,6 @@ def drive(points: Array, at_edge: Any, corners: Ways, rng: np.random.Generator, 
     return Drive(state, truth, seen[named], seen_by, seen, observed)
 
 
-def rigid(true: Array, found: Array) -> Array:
-    """true_from_found (4, 4) that brings positions (K, 3) nearest to each other."""
-    return align_points(true, found)[0]
-
-
 def ate_m(true: Array, found: Array) -> float:
     return absolute_trajectory_error(*(Trajectory(np.arange(len(each)), each) for each in (found, true))).rmse_m
 
@@ -158,8 +153,8 @@ def test_a_joined_drive_is_as_good_as_alone_and_the_map_stays(seed: int) -> None
         [(-2, y[0]), (-2, y[1]), (end, y[1]), (end, y[2]), (-2, y[2]), (-2, y[1])],
     )
     first, later, known, sightings = driven(seed, *ways)
-    first_from_truth = rigid(first.state.map_from_body[:, :3, 3], first.map_from_body[:, :3, 3])
-    truth_from_later = rigid(later.map_from_body[:, :3, 3], later.state.map_from_body[:, :3, 3])
+    first_from_truth = align_points(first.state.map_from_body[:, :3, 3], first.map_from_body[:, :3, 3])[0]
+    truth_from_later = align_points(later.map_from_body[:, :3, 3], later.state.map_from_body[:, :3, 3])[0]
     start = first_from_truth @ truth_from_later @ later.state.map_from_body
     rough = adjust_jointly(UNPUBLISHED, known, later.state, start, sightings, SETTINGS, finely=False)
     joint = adjust_jointly(UNPUBLISHED, known, later.state, rough.map_from_body, sightings, SETTINGS, finely=True)
@@ -267,12 +262,6 @@ def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
     assert np.abs(aside_m).max() < 0.01
 
 
-def published(made: Drive) -> BaseMap:
-    """The drive's survey as a site's map."""
-    state = made.state
-    return BaseMap(plain_survey(CAMERA, BODY_FROM_CAM, state.map_from_body, state.landmarks), CAMERA, BODY_FROM_CAM)
-
-
 @pytest.mark.parametrize("sees", ["little", "the end"])
 def test_a_published_map_is_held_by_all_that_it_knows_of_itself(sees: str) -> None:
     """Alone, the few landmarks that the later drive sees again move a keyframe with their noise, or its own that are new.
@@ -292,7 +281,8 @@ def test_a_published_map_is_held_by_all_that_it_knows_of_itself(sees: str) -> No
         kept = (marks.obs_keyframe < 20) | (rng.random(len(marks.points_map)) < 1 / 50)[marks.obs_landmark]
         marks = marks.taken(kept, marks.points_map, marks.obs_keyframe[kept], marks.obs_landmark[kept])
         first = replace(first, state=replace(first.state, landmarks=marks))
-    base = published(first)
+    survey = plain_survey(CAMERA, BODY_FROM_CAM, first.state.map_from_body, first.state.landmarks)
+    base = BaseMap(survey, CAMERA, BODY_FROM_CAM)
     joint = adjust_jointly(base, None, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     moved_m = np.linalg.norm((joint.base_from_body - base.map_from_body[joint.base_keyframes])[:, :3, 3], axis=1)
     assert moved_m.max() < {"little": 0.005, "the end": 0.0025}[sees]  # 0.0038 by the end's own landmarks

@@ -19,12 +19,10 @@ def drive(count: int = 20) -> Array:
     return driven([se3(so3_exp(np.array([0, 0, 0.05])), np.array([0.5, 0, 0]))] * (count - 1))
 
 
-def chain(places: Array) -> list[PoseEdge]:
-    return chain_of(places, repeat(np.diag([0.004**2] * 3 + [0.02**2] * 3)))
-
-
-def found(fixes: list[SessionFix]) -> list[Alignment]:
-    return alignments(fixes, drive(), GraphMarginals(drive(), chain(drive())))
+def found(fixes: list[SessionFix], places: Array | None = None) -> list[Alignment]:
+    places = drive() if places is None else places
+    chain = chain_of(places, repeat(np.diag([0.004**2] * 3 + [0.02**2] * 3)))
+    return alignments(fixes, places, GraphMarginals(places, chain))
 
 
 def fix(k: int, map_from_survey: Array, seed: int = 0) -> SessionFix:
@@ -57,7 +55,7 @@ def test_fixes_that_agree_with_each_other_but_not_with_the_motion_between_them_a
 def test_keyframes_of_one_place_count_once() -> None:
     standing = np.repeat(drive(2), 10, axis=0)
     fixes = [SessionFix(k, MAP_FROM_SURVEY @ standing[k], COVARIANCE, 40) for k in range(20)]
-    placed = alignments(fixes, standing, GraphMarginals(standing, chain(standing)))
+    placed = found(fixes, standing)
     assert len(placed[0].fixes) == 20
     assert placed[0].places == 1
 
