@@ -7,7 +7,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Self
+from contextlib import AbstractContextManager
 
 import foxglove
 import numpy as np
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 _IMAGE_EVERY_NS = 200_000_000
 
 
-class FoxgloveServer(ServerListener):
+class FoxgloveServer(ServerListener, AbstractContextManager["FoxgloveServer"]):
     """Encodes and sends in a thread of its own; methods may be called from any thread. Use it in `with`.
 
     A new viewer gets the last message of each topic. dropped: number of messages that arrived too fast to be encoded.
@@ -40,10 +40,10 @@ class FoxgloveServer(ServerListener):
     def __init__(self, host: str, port: int, name: str) -> None:
         """host, port: for viewers; name: shown by viewers. Raises UsageError if it cannot listen there."""
         self.dropped = 0
-        self._context = Context()
+        context = self._context = Context()
         # All before any viewer connects: an early subscription to a channel that is created later may be refused as unknown.
         self._channels = {
-            topic: Channel(topic, schema=schema, message_encoding=channels.encoding_of(schema), context=self._context)
+            topic: Channel(topic, schema=schema, message_encoding=channels.encoding_of(schema), context=context)
             for topic, schema in channels.CHANNELS.items()
         }
         self._waiting: dict[str, deque[Shown]] = {}
@@ -53,21 +53,13 @@ class FoxgloveServer(ServerListener):
         self._faults = LogLimit(_log)
         try:
             self._server = foxglove.start_server(
-                name=name,
-                host=host,
-                port=port,
-                server_listener=self,
-                message_backlog_size=_BACKLOG,
-                context=self._context,
+                name=name, host=host, port=port, server_listener=self, message_backlog_size=_BACKLOG, context=context
             )
         except (RuntimeError, OSError) as error:
             raise UsageError(f"--foxglove {host}:{port}: cannot listen there ({error}); choose another") from error
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
         self._thread = threading.Thread(target=self._serve, daemon=True, name="foxglove")
         self._thread.start()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._ended = True

@@ -6,7 +6,7 @@ import resource
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import partial
 from operator import methodcaller
@@ -50,7 +50,7 @@ class _Declaration:
     current: Any = None
 
 
-class Bus:
+class Bus(AbstractContextManager["Bus"]):
     """One participant, a zenoh session with explicit endpoints only: no multicast, no gossip, no discovery.
 
     Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES. Queries, replies and publications block while
@@ -122,9 +122,6 @@ class Bus:
                     if time.monotonic() > give_up_s:
                         raise LinkError(f"cannot listen on {self.endpoint} again ({error}); trying on") from error
                     time.sleep(_RETRY_S)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

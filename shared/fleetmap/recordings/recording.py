@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -92,7 +93,7 @@ class _SomeFrames(WrappedFrames):
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recording(AbstractContextManager["Recording"]):
     """An open recording: everything but the images in memory, images read on demand.
 
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
@@ -210,9 +211,6 @@ class Recording:
     def close(self) -> None:
         """Close open files; the recording's arrays stay usable."""
         self.frames.close()
-
-    def __enter__(self) -> "Recording":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

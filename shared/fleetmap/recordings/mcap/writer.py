@@ -30,7 +30,7 @@ BODY_FRAME, BASE_FRAME, MAP_FRAME, ODOM_FRAME = "body", "base", "map", "odom"
 _CHUNK_BYTES = 1 << 20  # the most that a flipped bit can destroy
 
 
-class McapRecordingWriter:
+class McapRecordingWriter(AbstractContextManager["McapRecordingWriter"]):
     """Writes one recording to `path`; the file appears there when it is closed, complete or not at all.
 
     Samples of one kind must be written in the order of their stamps; kinds may interleave in any way, ROS tools prefer them
@@ -162,9 +162,6 @@ class McapRecordingWriter:
         with suppress(OSError):  # of a full disk, by what is still in the file's buffer
             self._file.close()
         self._part.unlink(missing_ok=True)
-
-    def __enter__(self) -> "McapRecordingWriter":
-        return self
 
     def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
         if error_type is None:
