@@ -142,12 +142,7 @@ def _keep_recordings(
 
 
 def _opened_publisher(
-    stack: ExitStack,
-    config: LocclientConfig,
-    address: MapAddress,
-    bus: Bus | None,
-    calibration: RigCalibration,
-    intake: Intake,
+    stack: ExitStack, config: LocclientConfig, address: MapAddress, bus: Bus | None, rig: RigCalibration, intake: Intake
 ) -> Publisher:
     """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; to nobody without one it needs."""
     output = output_of(config.output)
@@ -155,7 +150,7 @@ def _opened_publisher(
         bus = stack.enter_context(Bus(config.output.endpoint).open())
     elif output.needs_bus and (bus is None or address.server is None):
         return NoPublisher()
-    publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)
+    publisher = output.open(config.output, bus, address.site, address.robot, rig, intake)
     stack.callback(publisher.close)
     return publisher
 

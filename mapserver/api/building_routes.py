@@ -34,7 +34,7 @@ async def _picture(request: Request) -> AsyncIterator[bytes]:
 
 
 File = Annotated[bytes, Depends(_body)]
-PlanFile = Annotated[bytes, Depends(_picture)]
+Plan = Annotated[bytes, Depends(_picture)]
 _WHAT = "the ETag of the areas that are changed: 412 if somebody changed them since"
 IfMatch = Annotated[str | None, Header(pattern=r'^(\*|(W/)?"[0-9a-f]{64}")$', description=_WHAT, examples=["*"])]
 _PIN = "NAME=PX,PY:X,Y: pixels right and down in the plan, and metres in `map`; at least two"
@@ -85,15 +85,9 @@ def alignment(store: p.Store, site: p.Site) -> dict[str, Any]:
     return dict(to_plain(found))
 
 
-@router.put("/v1/sites/{site}/alignment", openapi_extra=p.file_body("application/octet-stream"))
+@router.put("/v1/sites/{site}/alignment", openapi_extra=p.file_body())
 def set_alignment(
-    store: p.Store,
-    site: p.Site,
-    by: By,
-    data: PlanFile,
-    pin: Pins,
-    plan: PlanName = None,
-    metres_per_pixel: Scale = None,
+    store: p.Store, site: p.Site, by: By, data: Plan, pin: Pins, plan: PlanName = None, metres_per_pixel: Scale = None
 ) -> dict[str, Any]:
     """Align the map with the picture of a floor plan (PNG, JPEG, TIFF, BMP or PGM), or with pins alone, as `mapserver align`."""
     store.current(site)

@@ -51,11 +51,7 @@ def inbox(runs: Runs, store: p.Store, site: p.Site) -> Inbox:
     return contents(runs.inbox / site, SETTLE_S, time.time_ns())
 
 
-@router.put(
-    "/v1/sites/{site}/inbox/{name}",
-    status_code=201,
-    openapi_extra=p.file_body("application/octet-stream", required=True),
-)
+@router.put("/v1/sites/{site}/inbox/{name}", status_code=201, openapi_extra=p.file_body(required=True))
 async def upload_recording(
     request: Request, runs: Runs, service: p.Service, site: p.Site, name: p.RecordingName, who: By
 ) -> views.Uploaded:

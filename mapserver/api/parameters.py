@@ -113,7 +113,7 @@ def time_range(since: Since = None, until: Until = None) -> tuple[int | None, in
 TimeRange = Annotated[tuple[int | None, int | None], Depends(time_range)]
 
 
-def file_body(media_type: str, **more: bool) -> dict[str, Any]:
+def file_body(media_type: str = "application/octet-stream", **more: bool) -> dict[str, Any]:
     """The OpenAPI description of a body that is a file."""
     return {"requestBody": {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}, **more}}
 

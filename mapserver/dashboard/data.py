@@ -31,9 +31,6 @@ T = TypeVar("T")
 _GRID_HEIGHT_M = 1.1  # as the API's grid without a height
 JOBS_SHOWN = 100
 MANY_SITES = 1000
-Span = tuple[int | None, int | None]
-"""From when and until before when, nanoseconds since 1970; None: without an end."""
-EVER: Span = (None, None)
 _LONG_SIDE_PX = 2000
 _FINEST_M = 0.02
 _INK_BGR, _FREE_BGR = (150, 140, 130), (130, 170, 110)

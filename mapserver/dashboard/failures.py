@@ -13,12 +13,11 @@ from fleetmap.messages import Cause, FailureKind
 from mapserver.api.incidents import incidents, of_failure
 from mapserver.api.moments import read_moment
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
-from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES, places_of
 from mapserver.dashboard.fleet_parts import bar_edges, page_of
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.fleet.alerts import Incident, with_acts
-from mapserver.store import FailureFilter, FailureRow
+from mapserver.store import EVER, FailureFilter, FailureRow
 
 AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
 _SHADES = 6  # of causes; the last is that of all others

@@ -8,7 +8,7 @@ from fleetmap.bow.vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError
 from mapserver.api.incidents import of_drafts
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
-from mapserver.dashboard.data import EVER, MapData
+from mapserver.dashboard.data import MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, square
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
@@ -20,7 +20,7 @@ from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
 from mapserver.quality.gate import CHECKS
 from mapserver.releases.version_diff import Difference
-from mapserver.store import Event, SiteReleases, VerdictRow, VersionInfo
+from mapserver.store import EVER, Event, SiteReleases, VerdictRow, VersionInfo
 
 _EVENTS_SHOWN = 50
 _STATES = {

@@ -11,7 +11,6 @@ from mapserver.api.moments import hours_within
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.administration import cannot_enrol
 from mapserver.dashboard.console import PageContext, Services, scene_of
-from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import DAY_H, DAYS_SHOWN, WEEK_H, SiteHealth
 from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges, page_of
 from mapserver.dashboard.live import ORDER, LiveRobot
@@ -23,6 +22,7 @@ from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, figure, kpis
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE
+from mapserver.store import EVER
 from mapserver.trust.enrolment import RobotRegister
 
 _COLUMNS = {

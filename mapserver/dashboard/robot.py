@@ -10,7 +10,6 @@ from typing import NamedTuple
 from fleetmap.errors import UsageError
 from fleetmap.messages import Flag
 from mapserver.dashboard.console import PageContext, Services, scene_of
-from mapserver.dashboard.data import EVER
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.fleet_parts import Sentence
@@ -19,7 +18,7 @@ from mapserver.dashboard.map_layers import Layer, Line
 from mapserver.dashboard.overview import alerts_of, remarks, since_words
 from mapserver.fleet_statistics.kpis import hour_of
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
-from mapserver.store import FailureFilter, TraceRow
+from mapserver.store import EVER, FailureFilter, TraceRow
 
 _USUAL_NS = 24 * 3_600_000_000_000
 _TICKS, _BAND_PARTS = 5, 400

@@ -76,11 +76,8 @@ class AreaCorrections:
         survey = before.survey
         removed = survey.landmark_ids[self._is_gone(survey.points_map)]
         is_due = self.is_due(survey.points_map)
-        return replace(
-            before,
-            survey=kept(survey, ~is_due) if is_due.any() else survey,
-            removed_ids=removed if len(removed) else None,
-        )
+        survey = kept(survey, ~is_due) if is_due.any() else survey
+        return replace(before, survey=survey, removed_ids=removed if len(removed) else None)
 
     def frozen(self, points_map: AnyArray) -> Mask:
         """Return (N,) which points (N, 2) or (N, 3) are kept as in the version before."""

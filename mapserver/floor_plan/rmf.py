@@ -199,12 +199,8 @@ def rmf_text(building: Building, floors: Sequence[Floor]) -> str:
             lifts[name]["highest_floor"] = level
             lifts[name]["level_doors"][level] = []
     levels = {floor.level: {"elevation": floor.height_m} for floor in building.floors}
-    content = {
-        "name": building.name,
-        "coordinate_system": "cartesian_meters",
-        "levels": levels,
-        "lifts": dict(sorted(lifts.items())),
-    }
+    in_order = dict(sorted(lifts.items()))
+    content = {"name": building.name, "coordinate_system": "cartesian_meters", "levels": levels, "lifts": in_order}
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 

@@ -6,6 +6,7 @@ from mapserver.store.fleet_queries import FleetBatch as FleetBatch
 from mapserver.store.fleet_queries import tile_key as tile_key
 from mapserver.store.map_store import MapStore as MapStore
 from mapserver.store.operators import OperatorQueries as OperatorQueries
+from mapserver.store.queries import EVER as EVER
 from mapserver.store.rows import *  # noqa: F403
 from mapserver.store.usage import DiskSpace as DiskSpace
 from mapserver.store.usage import StoreUsage as StoreUsage

@@ -35,6 +35,8 @@ _OF_VERSIONS = ("manifest", "tile", "vocabulary")
 _RESTORED = "restored"
 _REQUESTS_KEPT = 4096
 Span = tuple[int | None, int | None]
+"""From when and until before when, nanoseconds since 1970; None: without an end."""
+EVER: Span = (None, None)
 
 
 class StoreQueries:
@@ -240,7 +242,7 @@ class StoreQueries:
             change.log(site, kind, detail, actor=actor)
 
     def events(
-        self, site: str, span_ns: Span = (None, None), *, after: int = 0, limit: int | None = None
+        self, site: str, span_ns: Span = EVER, *, after: int = 0, limit: int | None = None
     ) -> list[records.Event]:
         """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
         wanted = {"site": site, "id >": after, "stamp_ns >=": span_ns[0], "stamp_ns <": span_ns[1]}
@@ -269,7 +271,7 @@ class StoreQueries:
         person: str | None = None,
         kind: str | None = None,
         of_people: bool = False,
-        span_ns: Span = (None, None),
+        span_ns: Span = EVER,
         before: int | None = None,
         limit: int | None = None,
     ) -> list[records.AuditLine]:
@@ -325,12 +327,7 @@ class StoreQueries:
     # ------------------------------------------------------------------------------------------------------------- jobs
 
     def jobs(
-        self,
-        site: str | None = None,
-        span_ns: Span = (None, None),
-        *,
-        before: int | None = None,
-        limit: int | None = None,
+        self, site: str | None = None, span_ns: Span = EVER, *, before: int | None = None, limit: int | None = None
     ) -> list[records.JobInfo]:
         """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
         since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)

@@ -35,15 +35,11 @@ class OdometryRun:
     """Odometry of a recording or of sensors, frame by frame, with selection of keyframes."""
 
     def __init__(
-        self,
-        calibration: RigCalibration,
-        rectifier: Rectifier,
-        settings: SurveySettings,
-        keyframes_at: Container[int] = (),
+        self, rig: RigCalibration, rectifier: Rectifier, settings: SurveySettings, keyframes_at: Container[int] = ()
     ) -> None:
         """keyframes_at: numbers of frames, counted from 0, that always become keyframes."""
-        rig = MountedRig(calibration, rectifier.mounted[:1], rectifier.imu_minus_cam_s)
-        self._odometry = make_odometry(rig, settings.odometry, settings.stereo)
+        mounted = MountedRig(rig, rectifier.mounted[:1], rectifier.imu_minus_cam_s)
+        self._odometry = make_odometry(mounted, settings.odometry, settings.stereo)
         self._policy = KeyframePolicy(settings.keyframes, keyframes_at)
         self.chain = FrameChain()
 

@@ -237,13 +237,8 @@ class RobotRegister:
                     raise LinkError("key may not renew: the bundle was already used, or a key restored; enrol again")
                 if not is_repeated:
                     marks = {"mark": entry.next_mark, "mark_before": entry.mark} if entry.renewed_ns is not None else {}
-                    entry = msgspec.structs.replace(
-                        entry,
-                        key=asked.new_fingerprint,
-                        before=asked.old_fingerprint,
-                        renewed_ns=self.store.now_ns(),
-                        **marks,
-                    )
+                    keys = {"key": asked.new_fingerprint, "before": asked.old_fingerprint}
+                    entry = msgspec.structs.replace(entry, **keys, **marks, renewed_ns=self.store.now_ns())
                 certificate = self.authorities.sign_robot(asked.new_key, entry.certificate)
                 entries[site, robot] = entry
         except LinkError as error:

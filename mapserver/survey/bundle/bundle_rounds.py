@@ -47,11 +47,8 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     marks, motion, relative = state.landmarks, state.motion, dict[int, list[RelativeTerm]]()
     for term in motion.relative:
         relative.setdefault(term.i, []).append(term)
-    index = _WindowIndex(
-        _observations_of(marks.obs_keyframe, count),
-        _observations_of(marks.obs_landmark, len(marks.points_map)),
-        relative,
-    )
+    seen = _observations_of(marks.obs_keyframe, count), _observations_of(marks.obs_landmark, len(marks.points_map))
+    index = _WindowIndex(*seen, relative)
     # Windows write into these arrays: copying them for each window would be too slow.
     state = replace(
         state,
