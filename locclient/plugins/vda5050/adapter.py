@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.threads import Clock
 from locclient.hooks import LinkedRobot
 from locclient.plugins.vda5050.actions import MAP_ACTIONS, ActionBook, RefusedActionError, parameters
 from locclient.plugins.vda5050.fleet_maps import FleetMaps
@@ -47,11 +48,7 @@ class FleetAdapter:
     """
 
     def __init__(
-        self,
-        section: Vda5050Section,
-        maps: FleetMaps | None,
-        robot: LinkedRobot,
-        clock_s: Callable[[], float] = time.monotonic,
+        self, section: Vda5050Section, maps: FleetMaps | None, robot: LinkedRobot, clock_s: Clock = time.monotonic
     ) -> None:
         """maps: None if the map server selects the version."""
         self._section, self._maps, self._robot, self._clock_s = section, maps, robot, clock_s
