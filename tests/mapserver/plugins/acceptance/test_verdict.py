@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ HALVES = Areas.of([Area(name, ((box,),)) for name, box in (
 
 
 def both(first: Aisle, second: Aisle) -> Aisle:
-    return Aisle(*(np.concatenate([getattr(a, f.name) for a in (first, second)]) for f in fields(Aisle)))
+    return Aisle(*map(np.concatenate, zip(first, second, strict=True)))
 
 
 def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Report:
