@@ -214,9 +214,7 @@ def test_the_kernel_takes_the_rules_of_the_firewall() -> None:
     nft, unshare = shutil.which("nft"), shutil.which("unshare")
     alone = [str(unshare), "--map-root-user", "--net"]
     if nft is None or unshare is None or subprocess.run([*alone, "true"], check=False, capture_output=True).returncode:
-        pytest.skip(
-            "NO NFT: the firewall's rules are not tried; install Debian's nftables, where namespaces are allowed"
-        )
+        pytest.skip("NO NFT: the firewall's rules are not tried; install Debian's nftables, where namespaces work")
     words = f"{nft} -f {DEPLOY}/fleetmap.nft && {nft} -f {DEPLOY}/fleetmap.nft && {nft} list table inet fleetmap"
     done = subprocess.run([*alone, "sh", "-c", words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

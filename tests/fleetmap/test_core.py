@@ -162,9 +162,8 @@ HOSTILE = {
     "tracker": lambda image, places: tracked(image, np.column_stack([places, places[::-1, 0]])),
 }  # fmt: skip
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
-ANY_MATCH = StereoSettings(
-    min_correlation=-np.inf, uniqueness=np.inf, wide_half_px=7, narrow_half_px=7, agreement_px=np.inf
-)
+ANY = {"min_correlation": -np.inf, "uniqueness": np.inf, "agreement_px": np.inf}
+ANY_MATCH = StereoSettings(**ANY, wide_half_px=7, narrow_half_px=7)
 ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18, 1e308, 29.999999999999996, -1e-300]))
 
 

@@ -294,9 +294,8 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
 def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(world: World) -> None:
     robot = robot_world.new_robot()
     place = robot_world.truth(60) @ se3_inverse(robot.base_from_body)
-    told = InitialPoseMessage(
-        site="room", robot="r1", x_map_m=float(place[0, 3]) + 6.0, y_map_m=float(place[1, 3]), heading_rad=0.0
-    )
+    x_m, y_m = place[:2, 3].tolist()
+    told = InitialPoseMessage(site="room", robot="r1", x_map_m=x_m + 6.0, y_map_m=y_m, heading_rad=0.0)
 
     def tell() -> None:
         with MemoryBus(world.hub) as server:

@@ -65,9 +65,7 @@ def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
     corner = np.floor(points[:, :2] / 4)
     zones = np.unique([row - shift for row in corner for shift in product((0, 1), repeat=2)], axis=0)
     out += [(1e-3, np.isin(corner - zone, (0, 1)).all(axis=1)) for zone in zones]
-    kept: list[tuple[float | None, Array]] = [
-        (prior, ~mask[:, None] & np.ones(3, bool)) for prior, mask in out if mask.any()
-    ]
+    kept = [(prior, ~mask[:, None] & np.ones(3, bool)) for prior, mask in out if mask.any()]
     kept += [(1e-3, np.tile([True, True, False], (len(points), 1))), (1e-3, np.ones((len(points), 3), bool))]
     kept += [(1e-3, np.zeros((len(points), 3), bool)), (None, np.ones((len(points), 3), bool))]
 

@@ -26,9 +26,8 @@ LEFT, RIGHT, INFO = "/cam0/image_raw", "/cam1/image_raw", "/cam0/camera_info"
 GYRO, WHEEL, TF = "/imu0", "/odom", "/tf_static"
 WHEELS = [WheelSample(s + 1000, np.array([0.5, 0.0, 0.0]), 0.1, 0.1, 0.1) for s in STAMPS_NS]
 # Stereo, IMU, transforms and wheels, in the order of writing.
-DRIVE: list[Message] = foreign_messages() + [
-    (WHEEL, "nav_msgs/Odometry", w.stamp_ns, ros_messages.encode_odometry(w, "odom", "base_link")) for w in WHEELS
-]
+ROLLED = ((w.stamp_ns, ros_messages.encode_odometry(w, "odom", "base_link")) for w in WHEELS)
+DRIVE: list[Message] = foreign_messages() + [(WHEEL, "nav_msgs/Odometry", *rolled) for rolled in ROLLED]
 REPEATED = [message for message in DRIVE for _ in range(3 if message[0] == GYRO else 1)]
 FIRST, LENS = slice(0, 1), calibration().cameras[0]
 
@@ -41,8 +40,11 @@ def without(topic: str) -> list[Message]:
     return [message for message in DRIVE if message[0] != topic]
 
 
+EXCHANGED = (LEFT, *of(GYRO)[0][1:]), (GYRO, *of(LEFT)[0][1:])
+
+
 def twice(topic: str, *names: str) -> list[Message]:
-    """A topic's messages under two other names."""
+    """A topic's messages under other names."""
     return without(topic) + [(name, *message[1:]) for name in names for message in of(topic)]
 
 
@@ -91,11 +93,7 @@ def quaternion(scale: float) -> Callable[[Any], None]:
         (cut(LEFT, 0, 900), (1, 0, 0), "left images left out 1 of 4; the first: .*ends before"),
         (cut(GYRO, 3, 60), (0, 1, 0), "/imu0: damaged messages 1 left out"),
         (cut(WHEEL, 1, 3), (0, 0, 1), "/odom: damaged messages 1 left out"),
-        (
-            [(LEFT, *of(GYRO)[0][1:]), (GYRO, *of(LEFT)[0][1:]), *DRIVE],
-            (0, 0, 0),
-            f"another type {LEFT}: sensor_msgs/Imu left out",
-        ),
+        ([*EXCHANGED, *DRIVE], (0, 0, 0), f"another type {LEFT}: sensor_msgs/Imu left out"),
     ],
 )
 def test_one_bad_value_costs_one_value(

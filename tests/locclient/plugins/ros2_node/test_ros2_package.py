@@ -88,9 +88,8 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
 
     with installed(f"{sys.executable} -c {shlex.quote(PROGRAM)} {shlex.join(REFUSED)}") as refused:
         told = refused.communicate(timeout=PATIENCE_S)[1].split("exit 2\n")
-    assert (told.pop(), refused.returncode) == ("", 0) and all(
-        reason in each for reason, each in zip(REFUSED.values(), told, strict=True)
-    ), told
+    assert (told.pop(), refused.returncode) == ("", 0), told
+    assert all(reason in each for reason, each in zip(REFUSED.values(), told, strict=True)), told
     localizer = f"{built}/lib/fleetmap_ros/localizer --config locclient.toml"
     with (
         installed(f"{localizer} --ros-args -r __node:=place -p output.autostart:=false") as running,

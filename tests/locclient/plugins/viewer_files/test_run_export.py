@@ -24,9 +24,8 @@ pytestmark = pytest.mark.timeout(600)
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A store with a map, and the recording of a robot that is put down 2.4 m away."""
     folder = tmp_path_factory.mktemp("room")
-    return robot_world.stored(folder / "maps"), robot_world.write(
-        folder / "carried", robot_world.carried(FRAMES, CARRIED_AT)
-    )
+    carried = robot_world.write(folder / "carried", robot_world.carried(FRAMES, CARRIED_AT))
+    return robot_world.stored(folder / "maps"), carried
 
 
 def map_from_base(message: Any) -> Array | None:
