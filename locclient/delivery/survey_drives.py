@@ -1,7 +1,7 @@
 """Drives through areas of which operators want a new survey: kept on the disk as recordings, and handed to the server in parts.
 
 A drive begins and ends some metres outside of its area, where the map is known: what stands anew in it joins no map alone. A robot that
-loses its place inside goes on recording. Frames are as the cameras gave them, at most ten a second.
+loses its place inside goes on recording, a lifted one drops the drive. Frames are as the cameras gave them, at most ten a second.
 """
 
 import logging
@@ -16,7 +16,7 @@ from fleetmap.errors import FleetmapError, LinkError, disk_errors
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.geometry import Array, inside_rings
 from fleetmap.mapformat.building import edge_distance_m
-from fleetmap.messages import PART_BYTES, Status, SurveyArea, encode_message
+from fleetmap.messages import PART_BYTES, Cause, Status, SurveyArea, encode_message
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, jpeg_image, store_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
@@ -57,6 +57,9 @@ class SurveyDrives:
     def handle(self, bundle: SensorBundle, estimate: Estimate | None) -> None:
         """Take a bundle that the robot has localized; estimate: None without a frame."""
         if estimate is not None:
+            if estimate.cause is Cause.CARRIED:  # of a lifted robot nothing is known in between
+                self._is_useful = False
+                self._end()
             map_from_body = estimate.map_from_body if estimate.status is Status.TRACKING else None
             self._follow(None if map_from_body is None else map_from_body[:2, 3], estimate.stamp_ns)
         if self._area is None:

@@ -47,11 +47,6 @@ class AxesFit:
         """True for the axes stated by the recording."""
         return bool((self.body_from_accel == np.eye(3)).all())
 
-    @property
-    def is_reversed(self) -> bool:
-        """True if all axes have the wrong sign."""
-        return bool((self.body_from_accel == -np.eye(3)).all())
-
 
 def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[AxesFit]:
     """Return all possible orders and signs of the axes, the best first; empty with too few images."""
@@ -105,7 +100,7 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
         words = "no order of the accelerometer's axes lets a robot on wheels stand upright"
     else:
         # All axes reversed is one fault, a driver that reports gravity; it is likelier than two or three wrong axes.
-        likely = max(possible, key=lambda fit: 0.5 if fit.is_reversed else float(np.trace(fit.body_from_accel)))
+        likely = max(possible, key=lambda fit: 0.5 if (kept := float(np.trace(fit.body_from_accel))) == -3.0 else kept)
         words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: that fits the accelerations of the images"
     if given is not None:
         words += f"; as given, up is {np.round(given, 1) + 0.0} of the base"
@@ -118,8 +113,8 @@ def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> lis
     known = np.isfinite(turns.ways_m).all(axis=1)
     if len(imu) < 10 or known.sum() < 2:
         return []
-    turns = turns.only(np.flatnonzero(known))
-    starts_ns, ends_ns = (stamps + round(imu_minus_cam_s * 1e9) for stamps in (turns.starts_ns, turns.ends_ns))
+    rates_radps, ways_m = turns.rates_body_radps[known], turns.ways_m[known]
+    starts_ns, ends_ns = (each[known] + round(imu_minus_cam_s * 1e9) for each in (turns.starts_ns, turns.ends_ns))
     spans_s = (ends_ns - starts_ns) * 1e-9
     steps = max(1, round(_HALF_WINDOW_S / float(np.median(spans_s))))
     broken = np.flatnonzero(starts_ns[1:] != ends_ns[:-1]) + 1
@@ -129,8 +124,8 @@ def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> lis
         run: list[Posed] = [(int(starts_ns[first]), np.zeros(3), np.eye(3), np.zeros(3))]
         for k in range(first, end):
             _, place, rotation, _ = run[-1]
-            turn = turns.rates_body_radps[k] * spans_s[k]
-            run.append((int(ends_ns[k]), place + rotation @ turns.ways_m[k], rotation @ so3_exp(turn), turn))
+            turn = rates_radps[k] * spans_s[k]
+            run.append((int(ends_ns[k]), place + rotation @ ways_m[k], rotation @ so3_exp(turn), turn))
         for k in range(0, len(run) - 2 * steps, steps):
             rows = change_of_velocity(run[k : k + 2 * steps + 1], steps, imu)
             windows += [] if rows is None else [(rows, number)]

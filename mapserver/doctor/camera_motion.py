@@ -9,7 +9,7 @@ import numpy as np
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo import disparities
-from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Stamps
 from mapserver.doctor.sensors import SPARSE_S
@@ -45,10 +45,6 @@ class CameraTurns:
         moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
         rates = np.array([so3_log(motion[:3, :3]) for motion in moved]).reshape(-1, 3) / (np.diff(spans) * 1e-9)
         return cls(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
-
-    def only(self, kept: AnyArray) -> "CameraTurns":
-        """Return the intervals of a mask or of numbers."""
-        return CameraTurns(self.starts_ns[kept], self.ends_ns[kept], self.rates_body_radps[kept], self.ways_m[kept])
 
 
 class OdometryTurns:

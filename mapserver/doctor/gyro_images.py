@@ -10,7 +10,7 @@ from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words, in_axes
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.camera_motion import CameraTurns
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
-from mapserver.doctor.sensors import NO_IMU
+from mapserver.doctor.sensors import NO_IMU, median_period_s
 
 OFFSET, SCALE, AXES = "camera-imu time offset", "gyro scale", "gyro axes"
 _MIN_PAIRS = 20
@@ -20,6 +20,7 @@ _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
 _REACH, _NOISE_RADPS = 4.0, 0.01  # in typical deviations; intervals beyond are outliers, such as people in the picture
+_LACK, _LACK_SIGMAS = 0.3, 4.0  # share of the gyro's turns about an axis
 _PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not drift by half a frame within seconds
 
 
@@ -27,7 +28,7 @@ _PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not drift by half a fram
 class GyroFit:
     """Best fit of gyro to the images' rates: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images.
 
-    signed: the order and signs of the axes (3, 3) with a similar fit and the least change, None if absent.
+    signed: the order and signs of the axes (3, 3) with a similar fit and the least change, None if absent. unseen: as of `_unseen`.
     offsets_s: of stretches of the run that determine it separately, empty if fewer than two do.
     """
 
@@ -37,6 +38,7 @@ class GyroFit:
     correlation: float
     axes_seen: int
     signed: Array | None
+    unseen: dict[str, float]
     offsets_s: Array
 
     @property
@@ -48,11 +50,6 @@ class GyroFit:
     def is_sure(self) -> bool:
         """True if images and gyro agree well enough to correct the calibration by the offset."""
         return self.correlation > _SURE_CORRELATION and not self.is_unsteady
-
-    @property
-    def is_repeated(self) -> bool:
-        """True if two stretches of the run say the same offset."""
-        return self.is_sure and int((np.abs(self.offsets_s - self.offset_s) <= SAME_OFFSET_S).sum()) > 1
 
 
 def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], GyroFit | None]:
@@ -108,16 +105,30 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     most = 2.0 * (float(((turned / scale - seen) ** 2).sum()) + _AS_WELL * float((seen**2).sum()))
     good = [axes for axes in SIGNED_AXES if float(((centred / scale @ axes.T - seen) ** 2).sum()) <= most]
     signed = max(good, key=lambda axes: float(np.trace(axes)), default=None)
+    span_s = float(np.median(turns.ends_ns - turns.starts_ns)) * 1e-9
+    noise = 0.5 * float(np.diff(imu.gyro_radps, axis=0).var(axis=0).max()) * median_period_s(imu.stamps_ns) / span_s
+    unseen = (
+        _unseen(turned / scale, seen, noise) if np.isfinite(turns.ways_m).any() else {}
+    )  # one camera takes ways for turns
     parts = []
     for part in np.array_split(np.arange(len(all_seen)), _PARTS):
-        spread = float(np.sqrt(all_seen[part].var(axis=0).sum()))
-        if len(part) < _MIN_PAIRS or spread <= _LEAST_RATE_RADPS:
+        if len(part) < _MIN_PAIRS or float(np.sqrt(all_seen[part].var(axis=0).sum())) <= _LEAST_RATE_RADPS:
             continue
         shown = (_correlated(all_gyro[:, part], all_seen[part]) * body_from_gyro).sum(axis=(1, 2))
         if shown.max() > _SURE_CORRELATION:
             parts.append(_peak(offsets_s, shown, int(np.argmax(shown))))
     best_s = _peak(offsets_s, scores, offset)
-    return GyroFit(best_s, body_from_gyro, scale, float(scores[offset]), axes_seen, signed, np.array(parts))
+    return GyroFit(best_s, body_from_gyro, scale, float(scores[offset]), axes_seen, signed, unseen, np.array(parts))
+
+
+def _unseen(gyro: Array, seen: Array, noise: float) -> dict[str, float]:
+    """Return by axis of the body how much of the gyro's rates (K, 3) the images' show, where they certainly lack some: two drives along
+    one way have the same turns, but not what the ground does to the robot. noise: variance of the gyro's rates."""
+    inverse = np.linalg.pinv(gyro.T @ gyro)
+    shares, spreads = inverse @ gyro.T @ seen, inverse.diagonal()
+    sigmas = np.sqrt(spreads * (seen - gyro @ shares).var(axis=0))
+    lacking = 1.0 - len(seen) * spreads * noise - shares.diagonal() > np.maximum(_LACK, _LACK_SIGMAS * sigmas)
+    return {axis: float(share) for axis, share, lacks in zip("xyz", shares.diagonal(), lacking, strict=True) if lacks}
 
 
 def _correlated(gyro: Array, seen: Array) -> Array:
@@ -222,6 +233,9 @@ def _axes_finding(fit: GyroFit) -> Finding:
         axes = in_axes(fit.body_from_gyro)
         words = f"the gyro's axes are mirrored ({axes}); one has the wrong sign or two are exchanged"
         return Finding(AXES, Verdict.FAIL, None, limit, words)
+    for axis, share in fit.unseen.items():  # the first one is enough
+        words = f"the images show {share:.0%} of what the gyro turns about the body's {axis} axis: it is of another drive, or loose"
+        return Finding(AXES, Verdict.FAIL, share, "fail if 30 % are missing for sure", words)
     angle_deg = float(np.degrees(rotation_angle_rad(fit.body_from_gyro)))
     words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
     bad = f"{words} ({in_axes(fit.body_from_gyro)}); check body_from_cam (T_cam_imu) and how the IMU is mounted"

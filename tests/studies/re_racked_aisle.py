@@ -22,7 +22,7 @@ from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.recordings.images import StoredFrame, jpeg_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from fleetmap.sensors.samples import ImuSamples, Trajectory
+from fleetmap.sensors.samples import Trajectory
 from fleetmap.sources.source import ReplaySource
 from fleetsim.motion import Route
 from fleetsim.recorder import Order, record_order
@@ -47,7 +47,7 @@ from mapserver.store import Actor, MapStore
 from studies.study import PAGES, Column, Row, publish, results, table
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 
-SEEDS = (1013,)
+SEEDS = (1013, 2027)
 WORK = PAGES.parents[1] / "out" / "re_racked_aisle"
 SCENARIO, AISLE, HOUR_NS = "re-racked-aisle", 1, 3600 * 10**9
 _USUAL = layouts.last_restock_day
@@ -60,21 +60,17 @@ ASKED_NS = START_NS - HOUR_NS  # recordings of the simulator begin at one moment
 
 # What happens, and the faults of bad drives of that hour; drives are handed in where there is one
 HOURS = (
-    ("as mapped", ""), ("re-racked", ""), ("first pass", "cameras"), ("second pass", "imu"), ("third pass", "rig"),
-    ("after three passes", ""), ("lifted, misstated", "baseline lifted"),
+    ("as mapped", ""), ("re-racked", ""), ("first pass", "cameras"), ("second pass", "other-imu"), ("third pass", "rig"),
+    ("after three passes", "baseline"), ("lifted", "lifted"),
 )  # fmt: skip
 BAD = {
-    "cameras": "cameras exchanged", "baseline": "cameras stated 3 % too near to each other", "imu": "IMU turned by 90 degrees",
-    "other-imu": "IMU of another drive along the same way",
+    "cameras": "cameras exchanged", "baseline": "cameras stated 3 % too near to each other",
+    "other-imu": "IMU of the drive before, along the same way",
     "rig": "calibration of another lens", "lifted": "lifted in the aisle and carried 6 m on",
 }  # fmt: skip
 _X0, _X1, _Y = BEFORE.bay_x_m(0), BEFORE.bay_x_m(BEFORE.bays), BEFORE.aisle_y_m(AISLE)
-RING = [
-    (_X0, _Y - 1.7),
-    (_X1, _Y - 1.7),
-    (_X1, _Y + 1.7),
-    (_X0, _Y + 1.7),
-]  # the aisle, with the fronts of its racks
+# The aisle, with the fronts of its racks
+RING = [(_X0, _Y - 1.7), (_X1, _Y - 1.7), (_X1, _Y + 1.7), (_X0, _Y + 1.7)]
 
 
 def restocked(layout: Layout, seed: int, day: int, slot: Slot) -> int:
@@ -94,10 +90,11 @@ def scenario(name: str, *, is_changed: bool, is_lifted: bool) -> Scenario:
     return Scenario("", layout, {name: Run("tote", routes, 8.0)})
 
 
-def record(folder: Path, seed: int, name: str, *, is_changed: bool = True, is_lifted: bool = False) -> Path:
+def record(seed: int, name: str, *, is_changed: bool = True, is_lifted: bool = False) -> Path:
     """Recording of a run; each name drives a little differently."""
-    path = folder / f"{name}.mcap"
+    path = WORK / f"recordings-{seed}" / f"{name}.mcap"
     if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
         made = {SCENARIO: partial(scenario, name, is_changed=is_changed, is_lifted=is_lifted)}
         with patch.dict(SCENARIOS, made), patch.object(layouts, "last_restock_day", restocked):
             record_order(Order(SCENARIO, seed=seed, day=int(is_changed), robot=name), path.with_suffix(".part"))
@@ -199,16 +196,14 @@ class Site:
         self.said.append(last_report(self.folder / "store", site))
 
 
-def spoilt(folder: Path, kind: str, source: Path) -> Path:
-    """A copy of a good drive with a fault of the robot that made it."""
+def spoilt(folder: Path, kind: str, source: Path, before: Path) -> Path:
+    """A copy of a good drive with a fault of the robot that made it. before: recording of another drive along its way."""
     out = folder / f"{kind}.mcap"
-    with open_recording(source) as good:
+    with open_recording(source) as good, open_recording(before) as other:
         rig, imu = good.calibration, good.imu
         left, right = rig.cameras
-        if kind == "imu":
-            imu = ImuSamples(
-                imu.stamps_ns, *(values[:, [1, 0, 2]] * (1, -1, 1) for values in (imu.gyro_radps, imu.accel_mps2))
-            )
+        if kind == "other-imu":
+            imu = other.imu.between(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]) + 1)
         if kind == "rig":
             cameras = [replace(each, intrinsics_px=each.intrinsics_px * _OTHER_LENS) for each in rig.cameras]
             rig = replace(rig, cameras=tuple(cameras))
@@ -229,21 +224,19 @@ def hour(seed: int, number: int) -> Row:
     if number == 0:
         shutil.rmtree(folder, ignore_errors=True)
         (folder / "inbox").mkdir(parents=True)
-        mapped(folder / "store", record(folder, seed, "survey", is_changed=False), folder / "survey.json")
+        mapped(folder / "store", record(seed, "survey", is_changed=False), folder / "survey.json")
     site, faults = Site(folder, number), HOURS[number][1].split()
-    is_lifted = "lifted" in faults
-    path = record(folder, seed, name, is_changed=number > 0, is_lifted=is_lifted)
+    path = record(seed, name, is_changed=number > 0, is_lifted="lifted" in faults)
     if faults and not site.store.survey_requests(SITE):
         ask_for_survey(site.store, SITE, RING, Actor("ada", "new racks"))
     row: Row = {"seed": seed, "hour": number} | site.passed(path, name)
     if faults:
-        (drive,) = (folder / "drives" / name).glob("*.mcap")
-        row |= {"drive_mb": drive.stat().st_size / 1e6, "bad": {}}
-        for fault in faults:
-            bad = drive if fault == "lifted" else spoilt(folder, fault, drive)
+        drive, row["bad"] = next((folder / "drives" / name).glob("*.mcap"), None), {}
+        for fault in faults if drive is not None else ():
+            bad = drive if fault == "lifted" else spoilt(folder, fault, drive, record(seed, f"r{number - 1}"))
             site.send(bad, f"bad-{fault}")
             row["bad"][fault] = site.build()
-        if not is_lifted:
+        if drive is not None and "lifted" not in faults:
             site.send(drive, name)
             row["good"] = site.build()
     site.service.close()
@@ -266,8 +259,7 @@ def draw(rows: list[Row]) -> Figure:
     for axes, (key, title) in zip(figure.subplots(1, 2, sharey=True), titles.items(), strict=True):
         for seed in SEEDS:
             own = [row for row in rows if row["seed"] == seed]
-            shares = [100 * row[key] for row in own]
-            axes.plot([row["hour"] for row in own], shares, "o-", label=f"site {seed}")
+            axes.plot([row["hour"] for row in own], [100 * row[key] for row in own], "o-", label=f"site {seed}")
         axes.axhline(98, color="#888888", linestyle="--", linewidth=1, label="98 %")
         axes.set_xticks(range(len(HOURS)), [what for what, _ in HOURS], rotation=35, ha="right", fontsize=8)
         axes.set_title(title, fontsize=10)

@@ -140,9 +140,8 @@ def main() -> None:
     text = between_marks(RECORD.with_suffix(".md").read_text("utf-8"), page(made), RECORD)
     given.out.with_suffix(".md").write_text(text, encoding="utf-8")
     print(page(made))
-    sys.exit(
-        0 if all(of["holds"] for part in ("figures", "measured") for of in made[part].values()) and not failed else 1
-    )
+    holds = all(of["holds"] for part in ("figures", "measured") for of in made[part].values())
+    sys.exit(0 if holds and not failed else 1)
 
 
 if __name__ == "__main__":

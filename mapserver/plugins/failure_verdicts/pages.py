@@ -14,7 +14,7 @@ from mapserver.dashboard.install import Host
 from mapserver.dashboard.map_layers import Layer, Mark, Square
 from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.floor_plan.areas import OUTSIDE
-from mapserver.plugins.failure_verdicts.model import SAYS, Verdict
+from mapserver.plugins.failure_verdicts.model import SAYS
 from mapserver.plugins.failure_verdicts.verdicts import counted, judged
 from mapserver.store import FailureDetail, FailureRow
 
@@ -28,17 +28,13 @@ def install(host: Host) -> None:
         host.console.services.panels.setdefault(place, []).append(panel)
 
 
-def _judged(services: Services, row: FailureRow, report: FailureReport) -> Verdict:
-    return judged(services.maps.store, [FailureDetail(row, report, [])])[0]
-
-
 def _verdict(services: Services, _: PageContext, row: FailureRow, report: FailureReport) -> Markup:
-    return Markup(_PANELS.verdict(_judged(services, row, report)))
+    return Markup(_PANELS.verdict(judged(services.maps.store, [FailureDetail(row, report, [])])[0]))
 
 
 def _layers(services: Services, _: PageContext, row: FailureRow, report: FailureReport) -> list[Layer]:
     """Cells without their landmarks, and the places that it looks like."""
-    said = _judged(services, row, report)
+    (said,) = judged(services.maps.store, [FailureDetail(row, report, [])])
     missing = [
         Square((x, y, x + 1.0, y + 1.0), "removed", "landmarks are missing here", 0.5) for x, y in said.missing_m
     ]

@@ -9,7 +9,7 @@ from mapserver.fleet.exports import write_json_lines
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.plugins.failure_verdicts.model import Verdict, verdict
-from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore
+from mapserver.store import FailureDetail, FailureFilter, MapStore
 
 _WEEK_NS, _COUNTED, _AROUND = 168 * HOUR_NS, 200, 2000
 
@@ -18,15 +18,11 @@ def judged(store: MapStore, found: Sequence[FailureDetail]) -> list[Verdict]:
     """Return verdicts on failures of one site, given its others a week before and after them, as far as they are the last 2000."""
     times_ns, site = [each.failure.happened_ns for each in found] or [0], found[0].failure.site if found else ""
     around = FailureFilter(site, since_ns=min(times_ns) - _WEEK_NS, until_ns=max(times_ns) + _WEEK_NS)
-    by_tile, by_robot = defaultdict[str | None, list[FailureRow]](list), defaultdict[str, list[FailureRow]](list)
-    for row in store.fleet.failures(around, limit=_AROUND):
-        by_tile[row.tile].append(row)
-        by_robot[row.robot].append(row)
-    said = []
+    rows, said = store.fleet.failures(around, limit=_AROUND), []
     for row, report in ((each.failure, each.report) for each in found):
-        here, own = by_tile[row.tile] if row.tile else [], by_robot[row.robot]
-        others = {o.robot for o in here if abs(o.happened_ns - row.happened_ns) <= _WEEK_NS} - {row.robot}
-        tiles = {o.tile for o in own if abs(o.happened_ns - row.happened_ns) <= _WEEK_NS} - {row.tile, None}
+        near = [o for o in rows if abs(o.happened_ns - row.happened_ns) <= _WEEK_NS]
+        others = {o.robot for o in near if row.tile and o.tile == row.tile} - {row.robot}
+        tiles = {o.tile for o in near if o.robot == row.robot} - {row.tile, None}
         said.append(verdict(report, len(others), len(tiles)))
     return said
 

@@ -8,7 +8,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.common import estimator_loop
 from benchmarks.robot.aliased_starts import part_of, prior_at, within_budget
@@ -45,6 +44,7 @@ _LEFT_M, _RIGHT_M, _TILE_M, _RATE_HZ = 2.7, LAYOUTS[0].length_m - 2.7, 10.0, 5.0
 Random = np.random.Generator
 SETTINGS = LocalizerSettings()
 _LONGEST_S, _FLOOR_M = 34.0, 0.05  # of a drive; lower landmarks are the ground's
+_painted = lru_cache(maxsize=4)(paint_textures)
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,6 @@ def surveyed(seed: int) -> tuple[Tile, Vocabulary, float]:
     survey = EstimatorSession(_prepared(seed, 0, "survey", run), field=_usual(seed, 0))
     (tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=0.8)
     return within_budget(tile, survey.camera, survey.body_from_cam), vocabulary, survey.camera.focal_px
-
-
-_painted = lru_cache(maxsize=4)(paint_textures)
 
 
 def _prepared(seed: int, day: int, name: str, run: Run) -> Session:
@@ -180,11 +177,9 @@ def case_of(name: str, rng: Random, shared: Random, first: int, others: tuple[in
 
 
 LOOKALIKES = "identical aisle", "unmapped look-alike"
-TRUTHS = (
-    dict.fromkeys(("dark camera", "dirty camera", "overload", "carried", "wrong calibration", "pushed IMU"), "robot")
-    | dict.fromkeys(("restocked", "racks moved"), "building")
-    | dict.fromkeys(LOOKALIKES, "lookalike")
-)
+OWN = "dark camera", "dirty camera", "overload", "carried", "wrong calibration", "pushed IMU"
+TRUTHS = dict.fromkeys(OWN, "robot") | dict.fromkeys(("restocked", "racks moved"), "building")
+TRUTHS |= dict.fromkeys(LOOKALIKES, "lookalike")
 CAUSES = tuple(TRUTHS)
 
 
@@ -192,12 +187,9 @@ CAUSES = tuple(TRUTHS)
 def _view(seed: int, mapped: tuple[int, ...]) -> tuple[MapView, Tile]:
     tile, vocabulary, focal_px = surveyed(seed)
     centres = np.array([LAYOUT.aisle_y_m(aisle) for aisle in mapped])
-
-    def near(ys_m: Array) -> NDArray[np.bool_]:
-        return np.asarray((np.abs(ys_m[:, None] - centres) < LAYOUT.pitch_m / 2).any(axis=1))
-
     if len(mapped) < LAYOUT.aisles:
-        tile = part_of(tile, near(tile.points_map[:, 1]), near(tile.map_from_cam[:, 1, 3]))
+        ys_m = tile.points_map[:, 1], tile.map_from_cam[:, 1, 3]
+        tile = part_of(tile, *((np.abs(y_m[:, None] - centres) < LAYOUT.pitch_m / 2).any(axis=1) for y_m in ys_m))
     return MapView([tile], vocabulary, focal_px), tile
 
 

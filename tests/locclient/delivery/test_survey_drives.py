@@ -12,7 +12,7 @@ import pytest
 from fleetmap.errors import UnreachableError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.geometry import se3
-from fleetmap.messages import FailureAck, Status, SurveyArea, decode_message
+from fleetmap.messages import Cause, FailureAck, Status, SurveyArea, decode_message
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
@@ -37,7 +37,7 @@ def drive(
     drives: SurveyDrives, x_m: Iterable[float], start_ns: int = 10**12, *, lost: tuple[float, float] = (0, 0),
     others: tuple[CameraFrame, ...] = (),
 ) -> None:  # fmt: skip
-    """Along x, without a known place between two of them."""
+    """Along x, without a known place between two of them; who stands at 25.25 m is lifted."""
     for number, x in enumerate(x_m):
         stamp_ns = start_ns + number * STEP_NS
         is_lost = lost[0] < x < lost[1]
@@ -45,6 +45,7 @@ def drive(
             status=Status.LOST if is_lost else Status.TRACKING,
             map_from_body=None if is_lost else se3(np.eye(3), np.array([x, 0.0, 0.0])),
             stamp_ns=stamp_ns,
+            cause=Cause.CARRIED if x == 25.25 else Cause.NONE,
         )
         seen = tuple(replace(other, stamp_ns=stamp_ns) for other in others)
         drives.handle(SensorBundle(CameraFrame(stamp_ns, PICTURE, PICTURE, others=seen)), estimate)
@@ -77,6 +78,11 @@ def test_a_robot_that_loses_its_place_goes_on_recording(tmp_path: Path) -> None:
     ((frames, seconds),) = kept(tmp_path)
     assert frames == pytest.approx(10 * seconds, rel=0.05)
     assert seconds > 10
+
+
+def test_a_drive_in_which_the_robot_is_lifted_is_not_kept(tmp_path: Path) -> None:
+    drive(made(tmp_path), np.arange(0.25, 37.0, 0.5))
+    assert [frames for frames, _ in kept(tmp_path)] == [11], "another one begins behind that place"
 
 
 def test_what_shows_nothing_of_the_area_is_not_kept(tmp_path: Path) -> None:

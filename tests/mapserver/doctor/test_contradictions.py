@@ -83,6 +83,12 @@ def longer(times: float, *before: Change) -> Change:
     return change
 
 
+def rocking(recording: Recording) -> Recording:
+    """Two drives along one way share their turns, not what the ground does to them."""
+    gyro = recording.imu.gyro_radps
+    return replace(recording, imu=replace(recording.imu, gyro_radps=np.where([0, 1, 0], np.roll(gyro, 100, 0), gyro)))
+
+
 X, Y, Z = (np.diag(1.0 - 2.0 * np.eye(3)[axis]) for axis in range(3))
 YAW = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 CYCLE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -101,6 +107,7 @@ CASES = {
     "gyro exchanged": (imu(1.0, CYCLE), {"gyro axes": "x is z, y is x, z is y"}),
     "gyro in degrees": (imu(1.0, 180 / np.pi), {"gyro scale": "degrees per second"}),
     "IMU turned by 90 degrees": (imu(YAW, YAW), {"accelerometer axes": "x is -y", "gyro axes": "x is -y"}),
+    "IMU of another drive": (rocking, {"gyro axes": "% of what the gyro turns about the body's y axis"}),
     "wheels backwards": (wheels(-1.0), {"wheels": "backwards"}),
     "wheels backwards without IMU": (lambda r: wheels(-1.0)(without_imu(r)), {"wheels": "backwards"}),
     "wheels at rest": (wheels(0.0, 0.0), {"wheels": "rest while the images move"}),

@@ -67,7 +67,7 @@ def test_a_small_error_is_corrected_and_said(recording: Recording, checked: Chec
 
 
 def gyro_fit(offset_s: float, stretches_s: Sequence[float] = (), correlation: float = 0.97) -> GyroFit:
-    return GyroFit(offset_s, np.eye(3), 1.0, correlation, 3, np.eye(3), np.array(stretches_s))
+    return GyroFit(offset_s, np.eye(3), 1.0, correlation, 3, np.eye(3), {}, np.array(stretches_s))
 
 
 NOTHING, SAME, OTHER = MeasuredCalibration([], None), measured(P.TIME_OFFSET, -0.1038), measured(P.TIME_OFFSET, 0.0)
