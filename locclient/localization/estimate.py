@@ -136,7 +136,7 @@ def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
 def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypothesis, has_failed: bool) -> Estimate:
     elsewhere, settings = tracker.candidates.hypotheses, tracker.settings
     is_known = not np.isnan(confirmed.now.map_from_body).any()
-    radius_m = radius_95_m(confirmed.now.cov_rot_trans) if is_known else float("inf")
+    radius_m = radius_95_m(tracker.maps.with_error(confirmed.now).cov_rot_trans) if is_known else float("inf")
     is_late = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9 > settings.degraded_after_s
     is_broken = confirmed.has_broken or confirmed.lost_imu
     cause = _cause(estimate, has_failed=has_failed) or (Cause.ODOMETRY if is_broken else Cause.NONE)

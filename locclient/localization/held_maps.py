@@ -52,10 +52,10 @@ class HeldMaps:
         held = self.by_floor.get(place.floor)
         return np.diag((UNKNOWN_ERRORS if held is None else held.errors).sigmas(place.position_m) ** 2)
 
-    def with_error(self, place: Place, earlier: Place | None = None) -> Place:
-        """Return a place by the map with the map's own error there, or at an earlier place if that one is larger."""
+    def with_error(self, place: Place, earlier: Place | None = None, most: Array | float = np.inf) -> Place:
+        """Return a place by the map with the map's own error there, or at an earlier place if that one is larger; at most (6, 6)."""
         of_map = self.map_cov(place) if earlier is None else np.maximum(self.map_cov(place), self.map_cov(earlier))
-        return place._replace(cov_rot_trans=place.cov_rot_trans + of_map)
+        return place._replace(cov_rot_trans=place.cov_rot_trans + np.minimum(of_map, most))
 
     @property
     def lookalikes(self) -> LookAlikes | None:

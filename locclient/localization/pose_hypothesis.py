@@ -141,11 +141,8 @@ class PoseHypothesis:
             self.now = self.now.moved(step, step_cov(MEASURED_DRIFT if is_sure else RESTARTED, step_m))
         else:
             distance_m = length(motion.body_from_now[:3, 3])
-            drift = (
-                _VISION_ONLY
-                if self.is_by_vision
-                else (settings.drift_rad, settings.drift_floor_m, settings.drift_share)
-            )
+            usual = settings.drift_rad, settings.drift_floor_m, settings.drift_share
+            drift = _VISION_ONLY if self.is_by_vision else usual
             self.now = self.start.moved(motion.body_from_now, motion.cov_rot_trans + step_cov(drift, distance_m))
         if motion is None or motion.is_last:
             self.frame_index, self.is_by_vision = odometry.frame_index, False

@@ -264,8 +264,8 @@ class PoseTracker:
     def _doubt_confirmed(self, odometry: OdometryEstimate) -> None:
         """Turn a pose whose radius exceeds half of the site's smallest repetition into a prior: a fix of the next bay or aisle would be
         within the gate of its covariance, and must be confirmed like any other."""
-        confirmed = self.confirmed
-        if confirmed is None or not radius_95_m(confirmed.now.cov_rot_trans) > 0.5 * self.maps.alias_step_m:
+        confirmed, limit_m = self.confirmed, 0.5 * self.maps.alias_step_m
+        if confirmed is None or not radius_95_m(self.maps.with_error(confirmed.now).cov_rot_trans) > limit_m:
             return
         self.candidates.reset()
         self.candidates.abandoned, self.confirmed, self.prior, self.followed = confirmed, None, None, None
@@ -305,10 +305,10 @@ class PoseTracker:
 
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
-        assert self._query_frame is not None
-        found = [
-            (fix, PoseHypothesis.at_query(self._query_frame, self.maps.with_error(self.place_by(fix)))) for fix in fixes
-        ]
+        query = self._query_frame
+        assert query is not None
+        places = [self.maps.with_error(self.place_by(fix)) for fix in fixes]
+        found = [(fix, PoseHypothesis.at_query(query, place)) for fix, place in zip(fixes, places, strict=True)]
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:

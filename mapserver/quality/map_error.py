@@ -12,13 +12,13 @@ import scipy
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, skew
-from fleetmap.mapformat.map_errors import UNKNOWN_ERROR, ErrorSigmas
+from fleetmap.mapformat.map_errors import ErrorSigmas
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.rig import Looks, projection_by_point
 from mapserver.survey.survey_map import SurveyMap
 
 _APART_M = 5.0  # path between two passes: the errors of a map are alike over that
-_MOST_LOOKS, _LEAST_LOOKS, _LEAST_PLACES = 200, 10, 3
+_MOST_LOOKS, _MOST_PLACES, _LEAST_LOOKS, _LEAST_PLACES = 200, 64, 10, 3
 _LEAST_MATCHES = 12
 _MOST_OBSERVATIONS = 400_000  # of some landmarks, if there are more
 _VAGUE_M = 0.3  # sigma of a point by one pass
@@ -40,18 +40,18 @@ def map_errors(survey: SurveyMap, tiles: Sequence[tuple[int, int]], size_m: floa
     survey = kept(survey, _largest_part(survey) & (np.arange(len(survey.points_map)) % thinned == 0))
     map_from_cam = survey.map_from_body @ survey.body_from_cam
     rows = _linearised(survey, map_from_cam)
-    scales = _disagreement(survey, map_from_cam, rows)
-    if scales is None:
-        return {}
     off_m = np.linalg.norm((np.array(tiles)[:, None] + 0.5) * size_m - map_from_cam[:, :2, 3], axis=2)
     seen = off_m.min(axis=1) < size_m
-    variances = _marginals(survey, map_from_cam, rows, off_m[seen].argmin(axis=1)) / thinned
-    found = {}
-    for (x, y), own in zip(np.array(tiles)[seen], variances, strict=True):
-        values = [share * own[axes].mean() + beyond for axes, (share, beyond) in zip(_GROUPS, scales, strict=True)]
-        sigmas = np.clip(np.sqrt(values), 1e-5, UNKNOWN_ERROR)
-        found[f"{x},{y}"] = ErrorSigmas(*np.round(sigmas, 6).tolist())
-    return found
+    scales = _disagreement(survey, map_from_cam, rows) if seen.any() else None
+    if scales is None:
+        return {}
+    off_m, nearest = off_m[seen], np.unique(off_m[seen].argmin(axis=1))
+    nearest = nearest[np.unique(np.linspace(0, len(nearest) - 1, _MOST_PLACES).astype(int))]
+    own = _marginals(survey, map_from_cam, rows, nearest)[off_m[:, nearest].argmin(axis=1)] / thinned
+    of_groups = zip(_GROUPS, scales, strict=True)
+    variances = [share * own[:, axes].mean(axis=1) + beyond for axes, (share, beyond) in of_groups]
+    sigmas = np.round(np.clip(np.sqrt(np.stack(variances, axis=1)), 1e-5, 1.0), 6).tolist()
+    return {f"{x},{y}": ErrorSigmas(*each) for (x, y), each in zip(np.array(tiles)[seen], sigmas, strict=True)}
 
 
 def error_words(found: Mapping[str, Sequence[float]]) -> str:
@@ -94,7 +94,7 @@ def _marginals(survey: SurveyMap, map_from_cam: Array, rows: _Rows, chosen: NDAr
     cross = cameras.T @ points
     # A radian and a metre for each keyframe: what no observation ties to the others stays finite.
     information = cameras.T @ cameras - cross @ covs @ cross.T + scipy.sparse.eye_array(6 * keyframes)
-    solver = scipy.sparse.linalg.splu(information.tocsc())
+    solver = scipy.sparse.linalg.splu(information.tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
     moved = np.tile(np.eye(6), (keyframes, 1, 1))  # of each keyframe by a motion of the whole map
     moved[:, 3:, :3] = [-skew(off_m) for off_m in map_from_cam[:, :3, 3] - map_from_cam[:, :3, 3].mean(axis=0)]
     aligned = np.linalg.pinv(moved.reshape(-1, 6))

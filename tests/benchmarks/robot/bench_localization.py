@@ -20,8 +20,10 @@ from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status, robot_key
+from locclient.localization.place import boxminus
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
+from locclient.replay.run_result import ReplayResult
 from support.recordings.hashes import hashed, tiles_of
 
 # Options of `fleetsim record small-loop` for the robot's recording.
@@ -32,6 +34,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "opposite direction": ("--robot", "opposite-1", "--day", "1"),
     "another site": ("--robot", "runner-1", "--day", "1", "--seed", "1"),
 }
+_GOOD_M = 0.1
 _UNSURE = (Status.LOST, Status.AMBIGUOUS)
 
 
@@ -59,6 +62,25 @@ def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
         "stage_ms": run_metrics.stage_ms(frames),
         "status_share": run_metrics.status_share(frames),
     }
+
+
+def consistency(run: ReplayResult) -> dict[str, float]:
+    """How well covariances tell the errors of poses while TRACKING, 1.0 if exactly, and the share of good fixes that the gate refused."""
+    squared, looks, refused = list[list[float]](), 0, 0
+    for estimate, truth in zip(run.estimates, run.truths, strict=True):
+        map_from_body = estimate.map_from_body
+        if map_from_body is None or truth is None:
+            continue
+        error, covariance = boxminus(map_from_body, truth), estimate.cov_rot_trans
+        if estimate.status is Status.TRACKING:
+            parts = slice(3), slice(3, 6)
+            squared.append([error[a] @ np.linalg.solve(covariance[a, a], error[a]) / 3 for a in parts])
+        if estimate.innovation_m is not None:  # with the pose's error, the most that the fix is off
+            looks += 1
+            refused += estimate.fix is None and estimate.innovation_m + np.linalg.norm(error[3:]) < _GOOD_M
+    rotation, position = np.mean(squared, axis=0).tolist()
+    found = {"rotation_nees_per_dof": rotation, "position_nees_per_dof": position}
+    return found | {"good_fixes_refused_share": float(refused / looks)}
 
 
 def process_figures(recording: Path, store: Path) -> dict[str, float | None]:
@@ -91,7 +113,7 @@ def main(arguments: Options) -> Results:
         give_back_free_memory()
         slow = [slowness()]
         run = played(recording, store)
-        found[name] = run_figures(run.frames) | {"sha256": hashed(run.estimates)["estimates"]}
+        found[name] = run_figures(run.frames) | consistency(run) | {"sha256": hashed(run.estimates)["estimates"]}
         slow.append(slowness())
         found[name] |= {
             "slowness": mean_of(slow),

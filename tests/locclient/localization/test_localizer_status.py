@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.mapformat.map_errors import UNKNOWN_ERROR
+from fleetmap.mapformat.map_errors import UNKNOWN_ERROR, ErrorSigmas, MapErrors
 from fleetmap.messages import Cause, FailureKind, Status
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.estimate import assemble
@@ -363,6 +363,20 @@ def test_no_number_of_fixes_claims_more_than_the_map_knows(tracking: Robot) -> N
     estimate = tracking.ride(40, 0.05)[-1]
     assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= UNKNOWN_ERROR.up_m
     assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[:3, :3])[0]) >= UNKNOWN_ERROR.turn_rad
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "expected"), [(0.06, Status.TRACKING), (0.2, Status.DEGRADED), (0.9, Status.DEGRADED)]
+)
+def test_a_map_that_says_how_wrong_it_is_is_believed(tracking: Robot, sigma_m: float, expected: Status) -> None:
+    """From a radius of 0.3 m on the pose is no full knowledge; where the next place that looks alike is within it, it is a prior."""
+    wide = MapErrors(100.0, {(x, y): ErrorSigmas(0.01, sigma_m, sigma_m) for x in (-1, 0) for y in (-1, 0)})
+    maps = tracking.localizer.maps
+    maps.by_floor[""] = maps.by_floor[""]._replace(errors=wide)
+    estimate = tracking.ride(40, 0.05)[-1]
+    assert estimate.status is expected
+    assert tracking.error_m(estimate) < 0.05
+    assert np.sqrt(np.linalg.eigvalsh(estimate.cov_rot_trans[3:, 3:])[0]) >= sigma_m
 
 
 def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer() -> None:

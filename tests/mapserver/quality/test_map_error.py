@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from fleetmap.geometry import se3, skew, so3_exp
 from fleetmap.sensors.rectification import StereoCamera
@@ -52,10 +53,18 @@ def test_what_passes_disagree_beyond_their_noise_is_an_error_and_without_passes_
     apart[LAP:, 0, 3] += 0.04
     moved = map_errors(replace(survey, map_from_body=apart), TILES, 16.0)
     assert 0.001 < own["0,0"].horizontal_m < 0.012
-    assert 0.018 < moved["0,0"].horizontal_m <= 0.02, "no wider than unknown"
+    assert 0.021 < moved["0,0"].horizontal_m < 0.06, "wider than where it is unknown"
     for less in (observed(survey, survey.obs_keyframe < LAP // 2), replace(survey, scale_known=False)):
         assert map_errors(less, TILES, 16.0) == {}
     assert error_words({}).startswith("own error unknown")
+
+
+def test_tiles_without_marginals_of_their_own_have_those_of_the_nearest_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, tiles = two_laps(0), [(0, 0), (-1, 0), (-1, -1), (0, -1)]
+    every = map_errors(survey, tiles, 16.0)
+    monkeypatch.setattr("mapserver.quality.map_error._MOST_PLACES", 1)
+    assert len(set(every.values())) > 1 == len(set(map_errors(survey, tiles, 16.0).values()))
+    assert map_errors(survey, [(9, 9)], 16.0) == {}
 
 
 def test_drives_that_see_no_landmark_in_common_widen_no_error() -> None:
