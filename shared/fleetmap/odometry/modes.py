@@ -372,11 +372,15 @@ class StartingMode(GyroMode):
     waits_for_gravity = True
 
     def __init__(
-        self, window: SlidingWindow, imu: ImuInputs, since_ns: int = -(2**62), cam_from_previous: Array | None = None
+        self,
+        window: SlidingWindow,
+        imu: ImuInputs,
+        not_before_ns: int = -(2**62),
+        cam_from_previous: Array | None = None,
     ) -> None:
-        """since_ns: earlier samples led to a static start that was wrong."""
+        """not_before_ns: earlier samples led to a static start that was wrong."""
         super().__init__(window, imu, cam_from_previous)
-        self.since_ns = since_ns
+        self.not_before_ns = not_before_ns
         self._trajectory: list[tuple[int, Array]] = []
 
     def begin(self, stamp_ns: int) -> Mode:
@@ -404,7 +408,7 @@ class StartingMode(GyroMode):
         return Step(mode, step.used, change if begun is None else change @ begun)
 
     def _static_start(self, stamp_ns: int) -> InitialState | None:
-        since = self._imu.samples.imu.between(self.since_ns, stamp_ns + 1)
+        since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
         start = static_initialization(since, stamp_ns, self._rig.settings)
         return None if start is None else self._moving_evenly(start)
 

@@ -54,11 +54,17 @@ class Alignment:
 
 
 def align(
-    motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, settings: OdometrySettings, *, slack: float, steps: int
+    motion: VisualMotion,
+    imu: ImuSamples,
+    noise: ImuNoise,
+    settings: OdometrySettings,
+    *,
+    gravity_slack: float,
+    steps: int,
 ) -> Alignment | None:
     """Align with the given number of Gauss-Newton steps; None if the fitted gravity is implausible or a bias of either sensor too large.
 
-    slack: factor on the settings' tolerance of gravity's size in the linear step.
+    gravity_slack: factor on the settings' tolerance of gravity's size in the linear step.
     """
     gyro_bias = np.zeros(3)
     for _ in range(2):
@@ -68,7 +74,7 @@ def align(
         return None
     terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
     gravity = _free_gravity(motion, terms)
-    max_error = slack * settings.start.max_gravity_error_mps2
+    max_error = gravity_slack * settings.start.max_gravity_error_mps2
     if gravity is None or abs(np.linalg.norm(gravity) - GRAVITY_MPS2) > max_error:
         return None
     direction, accel_bias = gravity / np.linalg.norm(gravity), np.zeros(3)
@@ -204,7 +210,7 @@ def dynamic_initialization(
     """
     stamps_ns, rotations = vision.stamps_ns.tolist(), vision.frame_from_body[:, :3, :3]
     motion = VisualMotion(stamps_ns, rotations, vision.positions_m, None, 0.004, 0.04, (200.0, 20.0))
-    found = align(motion, imu, noise, settings, slack=2.0, steps=4)
+    found = align(motion, imu, noise, settings, gravity_slack=2.0, steps=4)
     return None if found is None else initial_state(vision, found)
 
 
@@ -223,7 +229,7 @@ def mono_inertial_initialization(
     levers_m, weights = -rotations @ body_from_cam[:3, 3], (1 / _POSITION_SIGMA_M, 1 / _VELOCITY_SIGMA_MPS)
     sigmas = _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS
     motion = VisualMotion(vision.stamps_ns.tolist(), rotations, levers_m, vision.positions_m, *sigmas, weights)
-    found = align(motion, imu, noise, settings, slack=3.0, steps=5)
+    found = align(motion, imu, noise, settings, gravity_slack=3.0, steps=5)
     if found is None:
         return None
     scale, sigma = float(found.solution[5]), float(np.sqrt(found.covariance[5, 5]))

@@ -128,7 +128,7 @@ class MonocularMode(Mode):
         self._stamps_ns.clear()
         self._unscaled.clear()
         if isinstance(mode, StartingMode):
-            self._not_before_ns = mode.since_ns
+            self._not_before_ns = mode.not_before_ns
         elif isinstance(mode, VisualMode):
             self.imu = None
 
