@@ -310,8 +310,7 @@ def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
     if not odometry.scale_known:
         placed &= odometry.tracked
     edges = np.flatnonzero(np.diff(np.concatenate([[False], placed, [False]]).astype(np.int8)))
-    runs = edges.reshape(-1, 2)
-    first, end = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
+    first, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
     inside = np.zeros(len(placed), bool)
     inside[first:end] = True
     odom_from_body, covariances = odometry.odom_from_body, odometry.covariances

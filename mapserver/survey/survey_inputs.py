@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,8 +21,7 @@ _RELEASED_EVERY = 4096  # steps of a stage: they read far fewer features than a 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
 
-@dataclass(frozen=True, slots=True)
-class TrackedFrame:
+class TrackedFrame(NamedTuple):
     """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; True if it becomes a keyframe."""
 
     number: int

@@ -1,4 +1,4 @@
-// Rectification: an image resampled by the tables of a lens, bilinear in fixed point, equal to OpenCV's to the bit.
+// Images resampled by the tables of a lens, and reduced; bilinear in fixed point, equal to OpenCV's for x86-64 to the bit.
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <limits>
@@ -12,9 +12,8 @@
 namespace fleetmap {
 namespace {
 
-constexpr ptrdiff_t kBlock = 8;   // pixels of a row that are made at once
-constexpr ptrdiff_t kReach = 16;  // pixels of a row of the source in one register
-constexpr size_t kMostPixels = std::numeric_limits<int32_t>::max();
+constexpr ptrdiff_t kBlock = 8;                             // pixels of a row that are made at once
+constexpr ptrdiff_t kReach = 16;                            // pixels of a row of the source in one register
 constexpr uint32_t kShares = 32, kAll = kShares * kShares;  // into which a pixel is divided along a row, and as a whole
 
 using Bytes [[gnu::vector_size(kReach)]] = uint8_t;
@@ -75,8 +74,10 @@ struct Block {
 
 class Remap {
  public:
-  Remap(const Array<int16_t, -1, -1, 2>& pixels, const Array<uint16_t, -1, -1>& shares, ptrdiff_t height, ptrdiff_t width)
-      : rows_(ptrdiff_t(shares.shape(0))), columns_(ptrdiff_t(shares.shape(1))), height_(height), width_(width) {
+  Remap(const Array<int16_t, -1, -1, 2>& pixels, const Array<uint16_t, -1, -1>& shares, size_t height, size_t width)
+      : rows_(ptrdiff_t(shares.shape(0))), columns_(ptrdiff_t(shares.shape(1))), height_(ptrdiff_t(height)), width_(ptrdiff_t(width)) {
+    if (!same_size(pixels, shares)) throw nb::value_error("shares: one for each of pixels");
+    if (std::max(height, width) > std::numeric_limits<int32_t>::max()) throw nb::value_error("height, width: below 2^31");
     for (ptrdiff_t row = 0; row < rows_; ++row)
       for (ptrdiff_t begin = 0; begin < columns_; begin += kBlock) {
         const ptrdiff_t first = row * columns_ + first_of(begin), count = std::min(kBlock, columns_);
@@ -147,19 +148,46 @@ class Remap {
   std::vector<std::pair<ptrdiff_t, Place>> others_;  // pixels of the result that are in no block
 };
 
+auto reduced(const Image& image, size_t height, size_t width) {
+  const GreyImage from = image;
+  if (height < 1 || width < 1 || height > image.shape(0) || width > image.shape(1)) throw nb::value_error("size: 1 to the image's");
+  // The first of the two pixels that number k of a reduced row or column lies between, and the other's share of 2048.
+  const auto place = [](size_t was, size_t is, size_t k) {
+    const float at = float((double(k) + 0.5) * (1.0 / (double(is) / double(was))) - 0.5);
+    return std::pair(int32_t(at), int16_t(std::nearbyint((at - std::floor(at)) * 2048.0f)));
+  };
+  auto made = unlocked([&] {
+    std::vector<uint8_t> to(height * width), row(image.shape(1) + 1);  // the pixel beyond a row has no share
+    std::vector<int32_t> first(width), pairs(width);                   // pairs: of bytes
+    std::vector<int16_t> share(width), lines(2 * width);  // lines: the last even and the last odd row reduced, 128 times as bright
+    for (size_t x = 0; x < width; ++x) std::tie(first[x], share[x]) = place(image.shape(1), width, x);
+    ptrdiff_t next = 0;
+    for (size_t y = 0; y < height; ++y) {
+      const auto [at, lower] = place(image.shape(0), height, y);
+      const ptrdiff_t last = std::min<ptrdiff_t>(at + 1, from.height - 1);
+      for (next = std::max<ptrdiff_t>(next, at); next <= last; ++next) {
+        std::copy_n(from.row(next), from.width, row.begin());
+        for (size_t x = 0; x < width; ++x) std::memcpy(&pairs[x], &row[size_t(first[x])], 2);
+        int16_t* const line = &lines[size_t(next & 1) * width];
+        for (size_t x = 0; x < width; ++x) line[x] = int16_t(((pairs[x] & 255) * (2048 - share[x]) + (pairs[x] >> 8) * share[x]) >> 4);
+      }
+      const int16_t *above = &lines[size_t(at & 1) * width], *below = &lines[size_t(last & 1) * width], upper = int16_t(2048 - lower);
+      uint8_t* __restrict out = &to[y * width];
+      for (size_t x = 0; x < width; ++x) out[x] = uint8_t((((above[x] * upper) >> 16) + ((below[x] * lower) >> 16) + 2) >> 2);
+    }
+    return to;
+  });
+  return as_numpy<uint8_t, 2>(std::move(made), {height, width});
+}
+
 }  // namespace
 
 void bind_remap(nb::module_& module) {
   nb::class_<Remap>(module, "Remap")
-      .def(
-          "__init__",
-          [](Remap* remap, const Array<int16_t, -1, -1, 2>& pixels, const Array<uint16_t, -1, -1>& shares, size_t height, size_t width) {
-            if (!same_size(pixels, shares)) throw nb::value_error("shares: one for each of pixels");
-            if (std::max(height, width) > kMostPixels) throw nb::value_error("height, width: below 2^31");
-            unlocked([&] { new (remap) Remap(pixels, shares, ptrdiff_t(height), ptrdiff_t(width)); });
-          },
-          "pixels"_a, "shares"_a, "height"_a, "width"_a)
+      .def(nb::init<const Array<int16_t, -1, -1, 2>&, const Array<uint16_t, -1, -1>&, size_t, size_t>(), "pixels"_a, "shares"_a, "height"_a,
+           "width"_a)
       .def("resample", &Remap::resample, "image"_a);
+  module.def("reduced", &reduced, "image"_a, "height"_a, "width"_a);
 }
 
 }  // namespace fleetmap

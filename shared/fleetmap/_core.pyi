@@ -258,6 +258,9 @@ def block_log_odds(
 def png_rows(filtered: _Grey, pixel_bytes: int) -> _Grey:
     """Bytes (H, N) of a PNG file's rows, from filtered ones (H, 1 + N); ValueError for a filter that there is not."""
 
+def reduced(image: _Grey, height: int, width: int) -> _Grey:
+    """The image as `cv2.resize` makes it on x86-64, to the bit; on ARM that rounds otherwise. No side may grow, or be 0."""
+
 class Remap:
     """Resamples images by the fixed-point tables of `cv2.convertMaps` as `cv2.remap` does, to the bit; beyond the image all is black."""
 

@@ -129,6 +129,7 @@ REFINEMENT = 4.0, 11.0, (10, 5)
         (lambda: core.BoxGrid(np.full((9, 8), 2e3), ZERO, np.array([256.0, 256.0, 256.0]), 1.0), "boxes"),
         (lambda: core.BoxGrid(BOX, ZERO, ONES, 1.0).bake(*NO_FACES, np.iinfo(np.int64).max, *UNLIT), "owner_shift"),
         (lambda: core.centroid_angles_deg(IMAGE[:0], np.zeros((3, 2), np.float32), 15), "image"),
+        (lambda: core.reduced(IMAGE, len(IMAGE) + 1, 1), "size"),
         (lambda: core.follow_pixels(IMAGE, IMAGE[:0], PLACES, PLACES, 7, 1, 1.0, 0.0), "images"),
         (lambda: tracker().begin(IMAGE[:0]), "images"),
         (lambda: tracker().track(IMAGE, None, None, np.eye(4), True, SAMPLES), "points_cam"),

@@ -1,6 +1,6 @@
 """Bundle adjustment of a survey: assembly of the problem, rounds with removal of outliers, local windows."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -39,6 +39,10 @@ def bundle_rounds(state: SurveyState, settings: SurveySettings, rounds: int = 3,
     return state
 
 
+# Observations by keyframe and by landmark, relative terms by their first keyframe: the cost of a window depends on its size only.
+_WindowIndex = tuple["scipy.sparse.csr_array", "scipy.sparse.csr_array", dict[int, list[RelativeTerm]]]
+
+
 def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     """Run local bundle adjustment: overlapping windows in order, all else fixed; global drift is left to the loops."""
     count, window = len(state.stamps_ns), settings.local_window
@@ -48,7 +52,7 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
     for term in motion.relative:
         relative.setdefault(term.i, []).append(term)
     seen = _observations_of(marks.obs_keyframe, count), _observations_of(marks.obs_landmark, len(marks.points_map))
-    index = _WindowIndex(*seen, relative)
+    index = *seen, relative
     # Windows write into these arrays: copying them for each window would be too slow.
     state = replace(
         state,
@@ -68,31 +72,22 @@ def _observations_of(owners: NDArray[np.int32], count: int) -> "scipy.sparse.csr
     return scipy.sparse.csr_array((np.ones(len(owners), bool), (owners, np.arange(len(owners)))), (count, len(owners)))
 
 
-@dataclass(frozen=True, slots=True)
-class _WindowIndex:
-    """Observations by keyframe and by landmark, relative terms by their first keyframe: the cost of a window depends on its size only."""
-
-    by_keyframe: "scipy.sparse.csr_array"
-    by_landmark: "scipy.sparse.csr_array"
-    relative: dict[int, list[RelativeTerm]]
-
-
 def _adjust_window(state: SurveyState, settings: SurveySettings, free: Mask, index: _WindowIndex) -> None:
     """Adjust one window with fixed earlier keyframes that see the same landmarks; landmarks seen only from elsewhere are unchanged.
 
     Writes to the arrays of `state`.
     """
-    marks, motion = state.landmarks, state.motion
+    marks, motion, (by_keyframe, by_landmark, by_first) = state.landmarks, state.motion, index
     inside = np.flatnonzero(free)
     first, last = inside[[0, -1]]
-    touched = np.unique(marks.obs_landmark[index.by_keyframe[inside].indices]).astype(np.int64)
-    rows = np.sort(index.by_landmark[touched].indices)
+    touched = np.unique(marks.obs_landmark[by_keyframe[inside].indices]).astype(np.int64)
+    rows = np.sort(by_landmark[touched].indices)
     # Later keyframes are still at their odometry poses: fixed, they would pull the window back to the drift.
     rows = rows[marks.obs_keyframe[rows] <= last]
     used = np.zeros(len(free), bool)
     used[marks.obs_keyframe[rows]] = True
     used[max(first - 1, 0) : last + 1] = True
-    relative = [term for k in np.flatnonzero(used).tolist() for term in index.relative.get(k, ())]
+    relative = [term for k in np.flatnonzero(used).tolist() for term in by_first.get(k, ())]
     keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]]
     landmark = np.searchsorted(touched, marks.obs_landmark[rows])
     landmarks = marks.taken(rows, marks.points_map[touched], keyframe, landmark)

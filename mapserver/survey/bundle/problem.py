@@ -16,8 +16,7 @@ from mapserver.survey.rig import Rig
 from mapserver.survey.state import PriorTerm, RelativeTerm
 
 
-@dataclass(frozen=True)
-class MotionPrior:
+class MotionPrior(NamedTuple):
     """Prior of keyframe k's motion and biases; a sigma of inf means no prior.
 
     mean (9,): velocity in map m/s, gyro bias rad/s, accelerometer bias m/s^2; sigma (9,).

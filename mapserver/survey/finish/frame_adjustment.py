@@ -4,8 +4,8 @@ Keyframes are fixed. Between two of them the frames, and their points tracked by
 together. The IMU constrains neighbouring frames; odometry does without an IMU, or if pictures show too little.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,16 +34,14 @@ _FINAL = BundleSettings(
 _WIDE = 25.0  # factor on odometry's covariance where it only determines what pictures cannot
 
 
-@dataclass(frozen=True, slots=True)
-class PlacedFrames:
+class PlacedFrames(NamedTuple):
     """map_from_body (F, 4, 4); seen (F,): True for frames located by points of keyframes, else by odometry or the IMU alone."""
 
     map_from_body: Array
     seen: Mask
 
 
-@dataclass(frozen=True, slots=True)
-class _Interval:
+class _Interval(NamedTuple):
     """Frames (n,) from one keyframe to the next, their slots (n,) in the problem, and a mask of observations (M,) of points seen
     by keyframes."""
 
@@ -155,9 +153,8 @@ class _Chain:
         at_keyframe, disparities = self.is_keyframe[nodes][which], pixels[:, 0] - pixels[:, 2]
         with np.errstate(invalid="ignore"):
             measured = np.isfinite(disparities) & (disparities > 0) & (camera.baseline_m > 0)
-        best = np.lexsort((-disparities, ~at_keyframe, ~measured, marks))[
-            np.searchsorted(np.sort(marks), np.arange(count))
-        ]
+        firsts = np.searchsorted(np.sort(marks), np.arange(count))
+        best = np.lexsort((-disparities, ~at_keyframe, ~measured, marks))[firsts]
         seen = camera.point_from_pixel(pixels[best, :2], disparities[best])
         at = map_from_cam[which[best]]
         points, known = np.einsum("nij,nj->ni", at[:, :3, :3], seen) + at[:, :3, 3], measured[best]

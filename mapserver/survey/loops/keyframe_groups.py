@@ -75,11 +75,8 @@ class WaitingRevisits:
         keyframes = sorted({other.edge.i for other in agreeing})
         places = marginals.map_from_body[keyframes, :3, 3]
         way_m = max(float(np.linalg.norm(a - b)) for a in places for b in places)
-        if (
-            len(keyframes) < _MIN_KEYFRAMES
-            or way_m < _MIN_WAY_M
-            or len(competitors) > _MOST_COMPETITORS * len(keyframes)
-        ):
+        is_short = len(keyframes) < _MIN_KEYFRAMES or way_m < _MIN_WAY_M
+        if is_short or len(competitors) > _MOST_COMPETITORS * len(keyframes):
             return []
         self._waiting = [other for other in self._waiting if other not in agreeing]
         return sorted(agreeing, key=lambda each: each.record)

@@ -1,7 +1,7 @@
 """Alignments of a survey to the map: sets of fixes whose relative motion agrees with the survey's own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,8 +18,7 @@ _PLACE_M = 1.0  # between independent fixes: nearer ones see the same objects
 _MAP_SHAPE = np.diag([0.003**2] * 3 + [0.02**2] * 3)  # of the map between two places: twice the error of surveys
 
 
-@dataclass(frozen=True, slots=True)
-class SessionFix:
+class SessionFix(NamedTuple):
     """Keyframe k of the new survey located in the map: map_from_body (4, 4), the covariance of its inverse in body axes, inliers."""
 
     k: int
@@ -28,8 +27,7 @@ class SessionFix:
     inliers: int
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
+class Alignment(NamedTuple):
     """The agreeing fixes (one for each keyframe), map_from_survey (4, 4) of the one that agrees with the most, and the number of
     their places.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -44,8 +44,7 @@ class PoseEdge:
     is_loop: bool
 
 
-@dataclass(frozen=True, slots=True)
-class PoseGraphResult:
+class PoseGraphResult(NamedTuple):
     """Optimised map_from_body (K, 4, 4).
 
     loop_weights has one number for each loop edge in order: 1 accepted, 0 rejected; below 0.5 a loop did not affect the result. cost: half

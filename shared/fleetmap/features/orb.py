@@ -102,8 +102,7 @@ def _detect_level(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels (N, 2) of the image and angles (N,) of the corners of a level."""
     scale = SCALE_FACTOR**level
-    height, width = (round(s / scale) for s in image.shape)
-    scaled = image if level == 0 else np.asarray(cv2.resize(image, (width, height)), np.uint8)
+    scaled = image if level == 0 else core.reduced(image, *(round(s / scale) for s in image.shape))
     limits, nowhere = (settings.min_distance_px, settings.fast_threshold, _BORDER_PX), np.zeros((0, 2), np.float32)
     chosen, _ = core.spread_corners(scaled, quota, *limits, nowhere, clearance_px, scale, _PATCH_RADIUS)
     pixels = (scale * chosen.astype(np.float64)).astype(np.float32)

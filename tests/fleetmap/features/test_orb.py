@@ -1,11 +1,14 @@
 """Grid ORB: spread, orientation, scale and determinism."""
 
+import platform
+
 import cv2
 import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
@@ -103,6 +106,15 @@ def test_by_night_more_of_the_scene_is_found_again(image: NDArray[np.uint8], mon
 def test_noise_is_measured_in_spite_of_the_scene(image: NDArray[np.uint8], sigma: float) -> None:
     noisy = np.clip(np.rint(image + np.random.default_rng(3).normal(0.0, sigma, image.shape)), 0, 255).astype(np.uint8)
     assert orb.noise_grey(noisy) == pytest.approx(sigma, abs=0.8)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="OpenCV rounds otherwise on other processors")
+@pytest.mark.parametrize("shape", [(480, 640), (480, 752), (376, 1241), (37, 53), (2, 9)])
+def test_pyramids_are_reduced_as_opencv_does_on_one_processor(shape: tuple[int, int]) -> None:
+    picture = np.random.default_rng(5).integers(0, 256, shape).astype(np.uint8)
+    for level in range(8):
+        height, width = (round(side / orb.SCALE_FACTOR**level) for side in shape)
+        np.testing.assert_array_equal(core.reduced(picture, height, width), cv2.resize(picture, (width, height)))
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 7), (2, 2), (3, 3)])
