@@ -71,14 +71,6 @@ struct Nearest {
     nearest.second = std::min(nearest.second, best);
 }
 
-// Rows' choices that their columns return.
-Pairs returned(const std::vector<int64_t>& choice, const Claims& claims) {
-  Pairs pairs;
-  for (size_t i = 0; i < choice.size(); ++i)
-    if (choice[i] >= 0 && claims.row[size_t(choice[i])] == int64_t(i)) pairs.push_back({int64_t(i), choice[i]});
-  return pairs;
-}
-
 // Pairs that are each other's nearest, by rising index in a: at most max_distance apart, and below ratio times the distance of
 // a's second nearest, of each of a with those of b whose node is one of its two: nodes_a holds two numbers for each of a, nodes_b one
 // for each of b, none negative. Ties go to the lower index. Sources: Lowe 2004; direct index, Galvez-Lopez and Tardos 2012, section III-B.
@@ -110,8 +102,9 @@ Pairs mutual_pairs(Descriptors a, const int32_t* nodes_a, Descriptors b, const i
       if (nearest.passes(max_distance, ratio)) choice[i] = nearest.found;
     }
   });
-  Pairs pairs = returned(choice, claims);
-  for (auto& [i, j] : pairs) j = order[size_t(j)];
+  Pairs pairs;  // rows' choices that their columns return
+  for (size_t i = 0; i < a.count; ++i)
+    if (choice[i] >= 0 && claims.row[size_t(choice[i])] == int64_t(i)) pairs.push_back({int64_t(i), order[size_t(choice[i])]});
   return pairs;
 }
 

@@ -189,12 +189,6 @@ bool map_covariance(const Mat6& information, const Mat3& map_from_cam, const Fix
   return is_finite(covariance.at, 36);
 }
 
-int image_cell(Vec3 pixel, const StereoImage& camera) {
-  const double column = std::clamp(pixel[0] / camera.width * kColumns, 0.0, kColumns - 1.0);
-  const double row = std::clamp(pixel[1] / camera.height * kRows, 0.0, kRows - 1.0);
-  return int(column) * int(kRows) + int(row);
-}
-
 using Floats = Array<float, -1>;
 using Cones = std::tuple<Points, Array<float, -1, 3>, Floats, Floats>;
 
@@ -411,8 +405,11 @@ class FixFinder {
       fix.matched = std::move(*matched);
     }
     bool is_held[int(kColumns * kRows)] = {};
-    for (size_t n = 0; n < fix.inliers.size(); ++n)
-      if (fix.inliers[n]) is_held[image_cell(fix.matched.pixels[n], camera_)] = true;
+    for (size_t n = 0; n < fix.inliers.size(); ++n) {
+      const double column = std::clamp(fix.matched.pixels[n][0] / camera_.width * kColumns, 0.0, kColumns - 1.0);
+      const double row = std::clamp(fix.matched.pixels[n][1] / camera_.height * kRows, 0.0, kRows - 1.0);
+      if (fix.inliers[n]) is_held[int(column) * int(kRows) + int(row)] = true;
+    }
     fix.cells = int(std::count(std::begin(is_held), std::end(is_held), true));
     fix.map_from_cam = map_from_cam;
     const auto inliers = std::count(fix.inliers.begin(), fix.inliers.end(), true);

@@ -36,10 +36,9 @@ inline Words high_product(Words a, Words b) { return Words(vqdmulhq_s16(int16x8_
 #endif
 
 inline Bytes half(const uint8_t (&from)[kBlock]) {
-  using Numbers [[gnu::vector_size(kReach)]] = uint64_t;
-  uint64_t number;
-  std::memcpy(&number, from, kBlock);
-  return Bytes(Numbers{number, 0});
+  Bytes bytes = {};
+  std::memcpy(&bytes, from, kBlock);
+  return bytes;
 }
 
 // A pixel of the source, and how far beyond it, in shares, the wanted place lies.
@@ -158,7 +157,7 @@ auto reduced(const Image& image, size_t height, size_t width) {
   };
   auto made = unlocked([&] {
     std::vector<uint8_t> to(height * width), row(image.shape(1) + 1);  // the pixel beyond a row has no share
-    std::vector<int32_t> first(width), pairs(width);                   // pairs: of bytes
+    std::vector<int32_t> first(width), pairs(width);
     std::vector<int16_t> share(width), lines(2 * width);  // lines: the last even and the last odd row reduced, 128 times as bright
     for (size_t x = 0; x < width; ++x) std::tie(first[x], share[x]) = place(image.shape(1), width, x);
     ptrdiff_t next = 0;

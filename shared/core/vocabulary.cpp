@@ -6,27 +6,22 @@
 namespace fleetmap {
 namespace {
 
-// Nodes are breadth first from the root; children are neighbours, none for a leaf. They come after their parent and before the end: every
-// descent ends in a leaf.
-void check_tree(const Packed& centres, const Numbers& first_child, const Numbers& child_count, const Numbers& word_of_node) {
-  const int64_t nodes = int64_t(centres.shape(0));
-  for (const Numbers* column : {&first_child, &child_count, &word_of_node})
-    if (int64_t(column->shape(0)) != nodes) throw nb::value_error("a vocabulary's columns have one number for each node");
-  if (nodes == 0) throw nb::value_error("a vocabulary has a root");
-  for (int64_t node = 0; node < nodes; ++node) {
-    const int64_t first = first_child(node), last = first + child_count(node);
-    if (child_count(node) > 0 && (first <= node || last > nodes)) throw nb::value_error("a vocabulary's children follow their parents");
-  }
-}
-
-// The word of each descriptor. Ties go to the lower node. Source: Nister and Stewenius 2006.
+// The word of each descriptor. Nodes are breadth first from the root; children are neighbours, none for a leaf. They come after their
+// parent and before the end: every descent ends in a leaf. Ties go to the lower node. Source: Nister and Stewenius 2006.
 auto descend(const Packed& packed, const Packed& packed_centres, const Numbers& first_child, const Numbers& child_count,
              const Numbers& word_of_node) {
   const Descriptors descriptors = packed, centres = packed_centres;
   const int32_t *const first_of = first_child.data(), *const count_of = child_count.data(), *const word_of = word_of_node.data();
+  for (const Numbers* column : {&first_child, &child_count, &word_of_node})
+    if (column->shape(0) != centres.count) throw nb::value_error("a vocabulary's columns have one number for each node");
+  if (centres.count == 0) throw nb::value_error("a vocabulary has a root");
   auto words = zeros<int32_t>(descriptors.count);
   unlocked([&] {
-    check_tree(packed_centres, first_child, child_count, word_of_node);
+    for (int64_t node = 0; node < int64_t(centres.count); ++node) {
+      const int64_t first = first_of[node], last = first + count_of[node];
+      if (last > first && (first <= node || last > int64_t(centres.count)))
+        throw nb::value_error("a vocabulary's children follow their parents");
+    }
     for (size_t i = 0; i < descriptors.count; ++i) {
       int32_t node = 0;
       while (count_of[node] > 0) {
