@@ -184,7 +184,7 @@ class Site:
         said = self.said.pop()
         return {
             "version": said["version"], "published": said["published"], "is_open": bool(self.store.survey_requests(SITE)),
-            "fates": {r["name"]: [r["fate"], r["reason"]] for r in said["recordings"]},
+            "fates": {r["name"]: [r["fate"], r["reason"].rpartition(f"{SITE}/")[2]] for r in said["recordings"]},
         }  # fmt: skip
 
     def _night(self, site: str) -> None:
