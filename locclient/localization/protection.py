@@ -9,7 +9,7 @@ from math import log
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import length, se3_inverse
+from fleetmap.geometry import Array, length, se3_inverse, transform_points
 from fleetmap.messages import Status
 from fleetmap.pnp.pnp import REFINEMENT
 from locclient.localization.alias_disambiguation import is_other_viewpoint
@@ -20,11 +20,18 @@ from locclient.localization.pose_tracker import PoseTracker, QueryResult
 from locclient.localization.settings import TrackSettings
 
 # Share of other places that match as one look does: of a map whose build did not measure it, and the least, since views of one rack are
-# not independent. One that matches twice as well counts as two looks at most, by an exponential tail.
-_WRONG_SHARE, _LEAST_SHARE, _MOST_LOOKS = 0.05, 0.02, 2.0
+# not independent. One that matches twice as well counts as two looks at most, by an exponential tail. Of starts, those beside the map.
+_WRONG_SHARE, _LEAST_SHARE, _MOST_LOOKS, _OUTSIDE_SHARE = 0.05, 0.02, 2.0, 0.05
 _LOOK_M = 0.5  # between looks
 _MOVED_SIGMAS = 3.0  # of a parameter of the mounting, from which on it counts
 _MOUNTING = PARAMETERS[TILT.start : HEIGHT]
+
+
+def middle_of(points_map: Array, map_from_cam: Array) -> Array:
+    """Return the medians (3,) of x / z, y / z and z, in the camera, of the points (N, 3) before it; zero without any."""
+    x, y, z = transform_points(se3_inverse(map_from_cam), points_map).T
+    places = np.array([x, y, z * z])[:, z > 0.0] / z[z > 0.0]
+    return np.median(places, axis=1) if places.size else np.zeros(3)
 
 
 class ProtectionMonitor:
@@ -55,7 +62,7 @@ class ProtectionMonitor:
             return
         lookalikes = tracker.maps.lookalikes
         share = _WRONG_SHARE if lookalikes is None else min(max(lookalikes.max_wrong_share, _LEAST_SHARE), 1.0)
-        evidence = -log(share)  # of a look
+        look = evidence = -log(share)
         if way is not None:
             evidence *= min(1.0, length(way.then.position_m) / _LOOK_M)
         if fix is None or fix.matched is None:
@@ -64,22 +71,30 @@ class ProtectionMonitor:
             return
         self._fix_ns, self._is_refused = stamp_ns, False
         if way is not None and not is_other_viewpoint(way.then.map_from_body):
+            self._bank.repeat()
             return
         matched, place, camera = fix.matched, tracker.place_by(fix), fix.matched.camera
         measured = matched.points_source, matched.pixels, 1.0 / matched.sigmas_px
         points, pixels, weights = map(np.ascontiguousarray, measured)
+        others = [] if fix.covisible is None else [fix.covisible.points_map[~fix.covisible.is_found]]
+        middle = middle_of(np.concatenate([points, *others]), place.map_from_body @ tracker.body_from_cam)
+        seen = points, pixels, weights, camera.lens, REFINEMENT, middle
         moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
         base_z_m = float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2])
         placed = place.map_from_body, tracker.body_from_cam, (camera.width_px, camera.height_px), base_z_m
-        self._bank.update(points, pixels, weights, camera.lens, REFINEMENT, *placed, 1e-9 * stamp_ns, *moved)
+        self._bank.update(*seen, *placed, 1e-9 * stamp_ns, *moved)
         tracker.followed = asked
         looks = 1.0 if way is not None else min(confirmed.support, 1.0 + confirmed.travelled_m // _LOOK_M)
         if lookalikes is not None:
             is_telling = fix.landmark_recall > lookalikes.recall
             looks *= min(max(fix.inliers / max(lookalikes.inliers, 1.0), 1.0), _MOST_LOOKS) if is_telling else 0.0
-        self._log_odds += looks * evidence
-        if way is None and (prior := tracker.confirmed_by) is not None:
-            self._log_odds -= log(settings.wrong_prior_share if prior.is_revisable else settings.protection_risk)
+        if way is None:
+            self._log_odds = -log(_OUTSIDE_SHARE)
+            if (prior := tracker.confirmed_by) is not None:
+                self._log_odds -= log(settings.wrong_prior_share if prior.is_revisable else settings.protection_risk)
+        # However much was seen before, as many failed looks as tell of a robot that was carried end the level.
+        most = settings.kidnap_fixes * look - log(settings.protection_risk)
+        self._log_odds = min(self._log_odds + looks * evidence, most)
 
     def judged(self, estimate: Estimate) -> Estimate:
         """Return the estimate with its levels: infinite where no level holds."""

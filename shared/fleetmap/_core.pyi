@@ -137,6 +137,7 @@ class ProtectionBank:
         weights: _Reals,
         lens: _Reals,
         refinement: tuple[float, float, tuple[int, int]],
+        middle: _Reals,
         map_from_body: _Reals,
         body_from_cam: _Reals,
         size_px: tuple[float, float],
@@ -146,7 +147,11 @@ class ProtectionBank:
         cov_way: _Reals,
     ) -> None:
         """Update by a fix, map_from_body (4, 4), and its matches as of refine_pnp. way (4, 4): of the body since the last fix, with its
-        covariance (6, 6) about its end. base_z_m: height of the robot's base in the map."""
+        covariance (6, 6) about its end. middle (3,): of x / z, y / z and z in the camera, of all landmarks that should be in view.
+        base_z_m: height of the robot's base in the map."""
+
+    def repeat(self) -> None:
+        """Count another fix from the viewpoint of the last one that agrees with it: no fault of one fix alone."""
 
     def level(
         self, map_from_body: _Reals, way: _Reals, cov_way: _Reals, cov_map: _Reals, point: _Reals, risk: float

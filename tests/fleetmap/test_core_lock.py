@@ -16,7 +16,8 @@ SHORT = """allocations compose_pose inertial_residual is_image_still linearise_t
     surfel_stride_px velocity_change_rows Filter.__init__ Filter.add_clone Filter.body_covariance Filter.cam_from_earlier
     Filter.correct_by_speed Filter.inflate Filter.inflate_velocity Filter.motion_between Filter.motion_since Filter.nav_state
     Filter.observe Filter.odom_from_body Filter.odom_from_clone Filter.predict_random_walk Filter.remove_clone Filter.return_to_clone
-    ProtectionBank.__init__ ScenePainter.__init__ Tracker.__init__ Tracker.add VoxelTable.__init__"""
+    ProtectionBank.__init__ ProtectionBank.level ProtectionBank.repeat ScenePainter.__init__ Tracker.__init__
+    Tracker.add VoxelTable.__init__"""
 
 
 @contextmanager

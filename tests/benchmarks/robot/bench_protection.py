@@ -20,6 +20,7 @@ from fleetmap.pnp.pnp import GATE_SQUARED, REFINEMENT, Correspondences, refine_p
 from fleetmap.sensors.rectification import StereoCamera
 from fleetsim.recorder import Order
 from locclient.localization.place import ORIGIN, Place, boxminus, boxplus
+from locclient.localization.protection import middle_of
 from support.estimator.simulated_run import EstimatorSession, unpictured
 from support.estimator.statistics import FeatureStatistics
 
@@ -92,8 +93,13 @@ def drive_of(site: str, seed: int) -> Drive:
 
 def _bend(rng: np.random.Generator, sigma_m: float) -> Callable[[Array], Array]:
     """A smooth random field of points (K, 3) with a Gaussian correlation. Source: Rahimi and Recht 2007 (random Fourier features)."""
-    waves, phases = rng.normal(0.0, 1.0 / _BEND_LENGTH_M, (3, 64, 3)), rng.uniform(0.0, 2.0 * np.pi, (3, 64))
-    return lambda m: sigma_m * np.sqrt(2.0 / 64) * np.cos(np.einsum("aek,nk->nae", waves, m) + phases).sum(axis=2)
+    waves, phases = rng.normal(0.0, 1.0 / _BEND_LENGTH_M, (3, 192)), rng.uniform(0.0, 2.0 * np.pi, 192)
+
+    def bent(m: Array) -> Array:
+        cosines = np.cos((m @ waves + phases).astype(np.float32))  # single precision: four times as fast
+        return np.asarray(sigma_m * np.sqrt(2.0 / 64) * cosines.reshape(-1, 3, 64).sum(axis=2), np.float64)
+
+    return bent
 
 
 def _measured(
@@ -164,8 +170,18 @@ def judged(
             continue
         size_px = drive.camera.width_px, drive.camera.height_px
         here, moved, cov_moved = map(np.ascontiguousarray, (fix.map_from_body, *way[:2]))
-        seen = matches.points_source, matches.pixels, 1.0 / matches.sigmas_px, drive.camera.lens, REFINEMENT, here
-        bank.update(*seen, drive.body_from_cam, size_px, 0.0, 0.4 * frame, moved, cov_moved)
+        seen = matches.points_source, matches.pixels, 1.0 / matches.sigmas_px, drive.camera.lens, REFINEMENT
+        bank.update(
+            *seen,
+            middle_of(mapped, here @ drive.body_from_cam),
+            here,
+            drive.body_from_cam,
+            size_px,
+            0.0,
+            0.4 * frame,
+            moved,
+            cov_moved,
+        )
         place, way, is_known = place.updated(fix), ORIGIN, True
         if frame > _STARTED:
             count(truth)

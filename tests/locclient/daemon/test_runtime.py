@@ -313,6 +313,20 @@ def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(worl
     assert (event.actor, event.reason) == ("ada", "it was pushed")
 
 
+def test_a_level_above_the_alert_limit_is_told_as_a_degraded_pose(world: World) -> None:
+    bundles = list(robot_world.bundles(100))
+    free = world.drive(bundles)
+    limit_m = float(np.median([one.protection_m for one in free if one.protection_m < np.inf]))
+    robot = robot_world.new_robot()
+    source = ScriptedSource(bundles, {}, lambda: robot.running is not None)
+    said = started(world.parts(source, robot, Listener())._replace(stop_above_m=limit_m))
+    is_stopped = [one.status is Status.TRACKING and not one.protection_m <= limit_m for one in free]
+    assert 0 < sum(is_stopped) < sum(one.status is Status.TRACKING for one in free)
+    assert [one.protection_m for one in said] == [one.protection_m for one in free]
+    wanted = [Status.DEGRADED if is_above else one.status for one, is_above in zip(free, is_stopped, strict=True)]
+    assert [one.status for one in said] == wanted
+
+
 @pytest.mark.parametrize(("at", "ahead_ns"), [(0, 5 * 10**9), (60, 4 * 10**8), (60, 5 * 10**9), (60, 2**62)])
 def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: int, ahead_ns: int) -> None:
     bundles = list(robot_world.bundles(100))

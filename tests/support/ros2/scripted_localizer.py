@@ -30,7 +30,7 @@ from support.recordings.recording_samples import calibration
 BUILDING_FROM_MAP = se3(np.eye(3), np.array([40.0, 0.0, 0.0]))
 SECTIONS = (
     OutputSection(format="ros2", node="whole", building_frame="building"),
-    OutputSection(format="ros2", node="bare", namespace="attic", map_topic="", publish_odom=False),
+    OutputSection(format="ros2", node="bare", namespace="attic", map_topic="", publish_odom=False, stop_above_m=0.2),
 )
 
 
@@ -51,7 +51,7 @@ def main() -> None:
     Node.get_publishers_info_by_topic = failing_look
     word = ""
     while word != "down":
-        told = replace(estimate(time.time()), floor="hall_2")
+        told = replace(estimate(time.time()), floor="hall_2", protection_m=0.25)
         published = odom.handle(told)._replace(building_from_map=BUILDING_FROM_MAP, level="2")
         for localizer in localizers:
             localizer.publish(told, published, np.eye(4))

@@ -185,13 +185,20 @@ def test_what_nodes_tell_of_their_map_of_a_building_of_a_stuck_robot_and_of_a_mi
         peer.listen("/tf_static", TF, **LATCHED)
         peer.listen("/map", "nav_msgs/msg/OccupancyGrid", **LATCHED)
         assert soon(lambda: diagnosis(peer, "whole")["message"] == "TRACKING")
-        told = {"map": "version 2 has no grid", "floor": "hall_2", "level": "2", "radius_95_m": "0.056"}
+        told = {
+            "map": "version 2 has no grid",
+            "floor": "hall_2",
+            "level": "2",
+            "radius_95_m": "0.056",
+            "protection_m": "0.250",
+        }
         assert told.items() <= diagnosis(peer, "whole").items()
         assert peer.newest("/map")["info"]["width"] == 3, "the last grid stays"
         assert soon(lambda: ("building", "map") in [link[:2] for link in links(peer, "/tf_static")])
 
         assert soon(lambda: "publisher /attic/tf" in peer.endpoints("bare", "/attic"))
         assert "publisher /attic/map" not in peer.endpoints("bare", "/attic")
+        assert soon(lambda: "stop: the protection level is above 0.2 m" in diagnosis(peer, "bare")["message"])
         peer.publish("/attic/tf", TF, transforms=[{"header": {"frame_id": "map"}, "child_frame_id": "odom"}])
         assert soon(lambda: is_contradicted(peer, "bare", "map -> odom"))
 
