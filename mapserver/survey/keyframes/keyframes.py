@@ -7,7 +7,6 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from msgspec import structs
 
 from fleetmap.features import orb, patch_align, stereo
 from fleetmap.features.extraction import extract
@@ -20,7 +19,6 @@ from mapserver.survey.state import ImageStore, Keyframe, Pictures
 from mapserver.survey.survey_inputs import SurveyTools
 
 _BATCH = 2  # frames for one call: 0.05 s each
-_WIDE = 2.0  # heights: in wider pictures, those of streets, half as many features again are taken
 
 
 def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
@@ -90,8 +88,7 @@ def _features_of(
 ) -> tuple[orb.Features, Array]:
     if frame is None:
         return orb.Features.empty(), np.zeros((0, 2))
-    count = settings.orb.count * (3 if camera.width_px > _WIDE * camera.height_px else 2) // 2
-    features = extract(frame.left, structs.replace(settings.orb, count=count), camera.clearance_px)
+    features = extract(frame.left, settings.orb, camera.clearance_px)
     disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
     return features, disparities * _disparity_scale(first, camera)
 
