@@ -77,19 +77,21 @@ class Remap {
       : rows_(ptrdiff_t(shares.shape(0))), columns_(ptrdiff_t(shares.shape(1))), height_(ptrdiff_t(height)), width_(ptrdiff_t(width)) {
     if (!same_size(pixels, shares)) throw nb::value_error("shares: one for each of pixels");
     if (std::max(height, width) > std::numeric_limits<int32_t>::max()) throw nb::value_error("height, width: below 2^31");
-    for (ptrdiff_t row = 0; row < rows_; ++row)
-      for (ptrdiff_t begin = 0; begin < columns_; begin += kBlock) {
-        const ptrdiff_t first = row * columns_ + first_of(begin), count = std::min(kBlock, columns_);
-        Place places[kBlock];
-        for (ptrdiff_t k = 0; k < count; ++k) {
-          const int16_t* const pixel = pixels.data() + 2 * (first + k);
-          const uint32_t share = shares.data()[first + k] & (kAll - 1);
-          places[k] = {pixel[0], pixel[1], uint8_t(share % kShares), uint8_t(share / kShares)};
+    unlocked([&] {
+      for (ptrdiff_t row = 0; row < rows_; ++row)
+        for (ptrdiff_t begin = 0; begin < columns_; begin += kBlock) {
+          const ptrdiff_t first = row * columns_ + first_of(begin), count = std::min(kBlock, columns_);
+          Place places[kBlock];
+          for (ptrdiff_t k = 0; k < count; ++k) {
+            const int16_t* const pixel = pixels.data() + 2 * (first + k);
+            const uint32_t share = shares.data()[first + k] & (kAll - 1);
+            places[k] = {pixel[0], pixel[1], uint8_t(share % kShares), uint8_t(share / kShares)};
+          }
+          blocks_.push_back(count == kBlock ? block_of(places) : Block{});
+          if (blocks_.back().at < 0)
+            for (ptrdiff_t k = 0; k < count; ++k) others_.emplace_back(first + k, places[k]);
         }
-        blocks_.push_back(count == kBlock ? block_of(places) : Block{});
-        if (blocks_.back().at < 0)
-          for (ptrdiff_t k = 0; k < count; ++k) others_.emplace_back(first + k, places[k]);
-      }
+    });
   }
 
   auto resample(const Image& image) const {
