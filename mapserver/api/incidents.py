@@ -51,7 +51,9 @@ def present(
     inbox: the folder with an inbox for each site, None without one.
     """
     now_ns = store.now_ns()
-    found = [one for one in active_alerts(store, fleet, settings, now_ns) if site is None or one.site in ("", site)]
+    found = [
+        alert for alert in active_alerts(store, fleet, settings, now_ns) if site is None or alert.site in ("", site)
+    ]
     for name in (info.site for info in store.sites() if site in (None, info.site)):
         found += of_drafts(store, name)
     if inbox is not None:

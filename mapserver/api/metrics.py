@@ -88,7 +88,7 @@ _COUNTERS = {
     **{f"{axis}_{name}": words for axis, sums in _SUMS.items() for name, words, _ in sums},
 }
 _MOST_LOST = 20  # of a site: each is a series of its own
-_USUAL = AlertSettings()
+_USUAL_ALERTS = AlertSettings()
 Figure = tuple[str, float, dict[str, str]]
 """Name, value and labels of a metric."""
 
@@ -100,7 +100,11 @@ class Metrics(Collector):
     """
 
     def __init__(
-        self, store: MapStore, fleet: Fleet, alerts: AlertSettings = _USUAL, certificate: HttpCertificate | None = None
+        self,
+        store: MapStore,
+        fleet: Fleet,
+        alerts: AlertSettings = _USUAL_ALERTS,
+        certificate: HttpCertificate | None = None,
     ) -> None:
         self._store, self._fleet, self._alerts, self._certificate = store, fleet, alerts, certificate
         own = self._registry = CollectorRegistry()

@@ -89,7 +89,9 @@ def _words(found: "ResurveyList") -> Iterator[str]:
     for asked in found.requests:
         corners = f"{len(asked.corners_map_m)} corners"
         yield f"request {asked.id} of {asked.actor or 'unnamed'}: {corners}, {asked.reason or '-'}"
-    yield from (f"{one.place}: surveyed; failures there: {one.effect}" for one in found.courses if one.effect)
+    yield from (
+        f"{course.place}: surveyed; failures there: {course.effect}" for course in found.courses if course.effect
+    )
     yield f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints"
 
 

@@ -149,8 +149,10 @@ def _facets(
         own = chosen.get(axis)
         counts = Counter(dict.fromkeys(areas if axis == "area" else (), 0))
         counts.update([] if own is None else {own: 0})
-        days, today = (Counter(_value(row, axis) for row in of if _fits(row, chosen, axis)) for of in (rows, of_today))
-        counts.update({value: count for value, count in days.items() if value})
+        all_days, today = (
+            Counter(_value(row, axis) for row in of if _fits(row, chosen, axis)) for of in (rows, of_today)
+        )
+        counts.update({value: count for value, count in all_days.items() if value})
         if not counts or (axis == "tile" and areas and not own):
             continue
         choices = []

@@ -100,7 +100,9 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
         words = "no order of the accelerometer's axes lets a robot on wheels stand upright"
     else:
         # All axes reversed is one fault, a driver that reports gravity; it is likelier than two or three wrong axes.
-        likely = max(possible, key=lambda fit: 0.5 if (kept := float(np.trace(fit.body_from_accel))) == -3.0 else kept)
+        is_reversed = [(fit.body_from_accel == -np.eye(3)).all() for fit in possible]
+        likelihoods = np.where(is_reversed, 0.5, [np.trace(fit.body_from_accel) for fit in possible])
+        likely = possible[likelihoods.argmax()]
         words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: that fits the accelerations of the images"
     if given is not None:
         words += f"; as given, up is {np.round(given, 1) + 0.0} of the base"

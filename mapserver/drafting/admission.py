@@ -144,12 +144,13 @@ def _unconfirmed(checks: CheckResults, gyro_s: float | None) -> dict[str, str]:
     """
     estimate, wrong, held = checks.calibration.estimate, checks.calibration.wrong(), dict[str, str]()
     clock = None if estimate is None else estimate.get(P.TIME_OFFSET)
-    repeats = checks.gyro is not None and (abs(checks.gyro.offsets_s - checks.gyro.offset_s) <= SAME_OFFSET_S).sum() > 1
+    gyro = checks.gyro
+    is_repeated = gyro is not None and (abs(gyro.offsets_s - gyro.offset_s) <= SAME_OFFSET_S).sum() > 1
     is_known = clock is not None and SURE_SIGMAS * clock.sigma < SAME_OFFSET_S
     if clock is not None and is_known and abs(clock.estimate - (gyro_s or 0.0)) > SAME_OFFSET_S:
         turns = "nothing sure" if gyro_s is None else f"{1e3 * gyro_s:+.1f} ms"
         held[P.TIME_OFFSET] = f"{1e3 * clock.estimate:+.1f} ms by the adjustment, {turns} by the gyro's turns"
-    elif not is_known and gyro_s is not None and not (abs(gyro_s) < _CORRECTED_FROM_S or repeats):
+    elif not is_known and gyro_s is not None and not (abs(gyro_s) < _CORRECTED_FROM_S or is_repeated):
         held[P.TIME_OFFSET] = f"{1e3 * gyro_s:+.1f} ms in one stretch of the drive only; drive more turns"
     moved = [p for p in (P.BASELINE, P.FOCAL) if p in wrong]
     scale = float(np.prod([1 + estimate.get(p).estimate for p in moved])) if estimate is not None else 1.0

@@ -122,7 +122,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     kind = replace(run.kind, lens=order.lens or run.kind.lens, rig=order.rig, hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
-    nominal, true = (nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting")))
+    nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
     motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
     rides_s = motion.rides_s if isinstance(motion, CarriedMotion) else []
     dark = [sensors.Fault("camera-dark", *ride_s) for ride_s in rides_s]

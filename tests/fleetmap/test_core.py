@@ -155,16 +155,21 @@ def test_a_depth_image_of_strange_numbers_gives_values(strange: float, lens: Arr
 
 # Calls with places (4, 2) of any numbers, at which they read a noisy image.
 HOSTILE = {
-    "match_rows": lambda image, places: core.match_rows(*[image] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0),
-    "match_rows, without a limit": lambda image, places: core.match_rows(*[image] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0),
+    "match_rows": lambda image, places: core.match_rows(
+        *[image] * 4, places, places[:, 0].copy(), StereoSettings(), 8.0
+    ),
+    "match_rows, without a limit": lambda image, places: core.match_rows(
+        *[image] * 4, places, places[:, 1].copy(), ANY_MATCH, 8.0
+    ),
     "follow_pixels": lambda image, places: core.follow_pixels(
         image, image[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
     ),
     "tracker": lambda image, places: tracked(image, np.column_stack([places, places[::-1, 0]])),
-}  # fmt: skip
+}
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
-ANY = {"min_correlation": -np.inf, "uniqueness": np.inf, "agreement_px": np.inf}
-ANY_MATCH = StereoSettings(**ANY, wide_half_px=7, narrow_half_px=7)
+ANY_MATCH = StereoSettings(
+    min_correlation=-np.inf, uniqueness=np.inf, wide_half_px=7, narrow_half_px=7, agreement_px=np.inf
+)
 ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18, 1e308, 29.999999999999996, -1e-300]))
 
 

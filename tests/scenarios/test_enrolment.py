@@ -101,5 +101,6 @@ def test_a_bus_that_listens_before_the_server_answers_is_the_thiefs() -> None:
 def test_the_demo_needs_no_keys(site: TlsSite) -> None:
     with site.serving("tcp/127.0.0.1:0"), Bus(site.endpoint).open() as robot:
         assert wanted(robot, "anybody") == 1
-    refused = site.run("mapserver", "serve", "--store", site.store, "--zenoh", "tls/127.0.0.1:0")
+    addresses = "--http", "127.0.0.1:0", "--zenoh", "tls/127.0.0.1:0"
+    refused = site.run("mapserver", "serve", "--store", site.store, *addresses)
     assert "has no certificate" in refused

@@ -264,7 +264,9 @@ class MembershipTest:
     def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
         """Return the pose with the most evidence; undecided if another is as good and no position prior distinguishes them."""
         ranked = sorted(found, key=lambda one: (one.seen.cells - 2 * one.seen.seen, -len(one.placed.fixes)))
-        best, *others = [one for n, one in enumerate(ranked) if not any(_is_same(one, other) for other in ranked[:n])]
+        best, *others = [
+            one for n, one in enumerate(ranked) if not any(_same_place(one, other) for other in ranked[:n])
+        ]
         alike = [best, *(one for one in others if one.seen.high >= max(_SHARED_SHARE, best.seen.low))]
         near = [one for one in alike if one.is_where_priors_say]
         if not near:  # for a drive with new aisles its own place may show less than a similar one elsewhere
@@ -307,6 +309,6 @@ def contradicts(seen: Confirmation) -> bool:
     return seen.blocks >= _MIN_BLOCKS and seen.high < _REMAINING_SHARE
 
 
-def _is_same(one: SessionPlace, other: SessionPlace) -> bool:
+def _same_place(one: SessionPlace, other: SessionPlace) -> bool:
     apart_m = np.linalg.norm((one.map_from_body - other.map_from_body)[:, :3, 3], axis=1)
     return bool(np.median(apart_m) < _SAME_PLACE_M)

@@ -82,14 +82,19 @@ def ransac_pnp(
 
 
 def pnp_with_rotation(
-    matches: Correspondences, rotation: Array, *, threshold_px: float, min_inliers: int, rotation_sigma_rad: float
+    matches: Correspondences,
+    cam_from_source_rotation: Array,
+    *,
+    threshold_px: float,
+    min_inliers: int,
+    rotation_sigma_rad: float,
 ) -> PnpResult | None:
-    """As `ransac_pnp` with a nearly known rotation (3, 3) of cam_from_source (from the IMU).
+    """As `ransac_pnp` with a nearly known rotation (3, 3) (from the IMU).
 
     One correspondence proposes the translation. Needs depth in both images. Finds the pose among far more wrong matches
     than three points can; none below min_inliers.
     """
-    known = np.ascontiguousarray(rotation), rotation_sigma_rad
+    known = np.ascontiguousarray(cam_from_source_rotation), rotation_sigma_rad
     return _result(core.pnp_with_rotation(*_sightings(matches), threshold_px, min_inliers, *known))
 
 

@@ -242,7 +242,7 @@ def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> No
     tracking.map_from_body[:3, 3] += off(-1.0)
     after = tracking.ride(12, 0.25)
     assert after[-1].status is Status.TRACKING
-    assert not any(estimate.moved_m for estimate in after)
+    assert all(estimate.moved_m is None for estimate in after)
 
 
 def test_a_robot_that_is_lifted_knows_at_once_that_it_is_lost(tracking: Robot) -> None:

@@ -357,13 +357,17 @@ class MapStart:
 
 
 def make_odometry(
-    rig: MountedRig, settings: OdometrySettings, stereo: StereoSettings | None = None, *, by_wheels: bool = False
+    rig: MountedRig,
+    settings: OdometrySettings,
+    stereo_settings: StereoSettings | None = None,
+    *,
+    by_wheels: bool = False,
 ) -> Odometry:
     """Create the odometry of a rig: `MonocularOdometry` for a single camera without a depth sensor; by_wheels: `WheelOdometry` if that has
     no IMU either, for a robot, whose map has the scale."""
     of_one_camera = WheelOdometry if by_wheels and rig.calibration.imu is None else MonocularOdometry
     kind = Odometry if rig.mounted[0].camera.baseline_m else of_one_camera
-    made = kind(rig, settings, stereo)
+    made = kind(rig, settings, stereo_settings)
     if isinstance(made, MonocularOdometry):
         made.vision.is_in_map = by_wheels
     return made

@@ -170,7 +170,11 @@ class Tracker:
         return None if found is None else found.cam_from_source
 
     def _rematch(
-        self, previous: RectifiedFrame, frame: RectifiedFrame, motion: MotionSince, rotation_sigma_rad: float | None
+        self,
+        previous: RectifiedFrame,
+        frame: RectifiedFrame,
+        motion_since: MotionSince,
+        rotation_sigma_rad: float | None,
     ) -> tuple[tuple[Earlier, ...], float]:
         """Start new tracks after a gap, from descriptor matches with the last few frames.
 
@@ -180,7 +184,7 @@ class Tracker:
         found = []
         free = np.ones(len(current.features), bool)
         for old in reversed(remembered):
-            matched = self._match_pair(old, current, free, motion(old.frame_index), rotation_sigma_rad)
+            matched = self._match_pair(old, current, free, motion_since(old.frame_index), rotation_sigma_rad)
             if matched is not None:
                 found.append(matched)
         share = sum(len(e.ids) for e in found) / max(len(current.features), 1)

@@ -363,7 +363,8 @@ def test_what_is_no_number_corrects_nothing(bad: float, gate: float) -> None:
     estimate = some_filter(np.random.default_rng(11))
     before, gyro = everything(estimate), np.array([0.0, bad, 0.0])
     assert estimate.correct_by_rest(gyro, 1e-3, gate) == np.inf
-    for sample in (WheelSample(0, gyro, 0.1, 0.1, 0.1), WheelSample(0, np.zeros(3), 0.1, bad, 0.1)):
+    for velocity_mps, sigma_mps in ((np.array([bad, 0.0, 0.0]), 0.1), (np.zeros(3), bad)):
+        sample = WheelSample(0, velocity_mps, 0.1, sigma_mps, 0.1)
         assert estimate.correct_by_wheel_sample(sample, np.zeros(3), np.eye(4), gate) == np.inf
     away = estimate.odom_from_body()
     away[0, 3] = bad
