@@ -12,6 +12,8 @@ from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Relocalizer
 from locclient.localization.place import Place
 
+UNKNOWN_COV = np.diag(UNKNOWN_ERRORS.sigmas(np.zeros(3)) ** 2)
+
 
 class HeldMap(NamedTuple):
     """A version of one floor's map: a relocalizer for each camera of the rig. The others: see `Localizer.handle_version`."""

@@ -10,12 +10,12 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, interpolate_se3, se3_inverse
-from fleetmap.mapformat.map_errors import UNKNOWN_ERRORS
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, FrameFeatures, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
+from locclient.localization.held_maps import UNKNOWN_COV
 from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.perception import Percept, QueryInput
 from locclient.localization.pose_hypothesis import PoseHypothesis
@@ -28,7 +28,6 @@ _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 # for a pose that is too vague.
 _MORE_SLICES = 3
 _TORN_SLICES = 2  # among places that the next looks may tell apart; three find the right one a fifteenth sooner
-_ERROR_CHANGE = np.diag(UNKNOWN_ERRORS.sigmas(np.zeros(3)) ** 2)  # of a map, from fix to fix: at most, for the search
 _COUNTERPART_M = 3.0  # around the place of a fix on another floor, whose map may lie so far off in the building
 _FIRST_SEARCHES = 10  # then the robot probably drives where nothing is mapped, and keeps to the time of a frame
 
@@ -234,7 +233,7 @@ class MapQuery:
         relocalizer = self._on(hypothesis.now.floor)
         if relocalizer is None:
             return None
-        place = self._maps.with_error(hypothesis.then, most=_ERROR_CHANGE).of_point(self._tracker.body_from_cam)
+        place = self._maps.with_error(hypothesis.then, most=UNKNOWN_COV).of_point(self._tracker.body_from_cam)
         return relocalizer.near(features, place.map_from_body, place.cov_rot_trans, earlier)
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:

@@ -15,7 +15,7 @@ from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, FrameFeatures
 from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
-from locclient.localization.held_maps import HeldMaps
+from locclient.localization.held_maps import UNKNOWN_COV, HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.place import ORIGIN, Place
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
@@ -219,6 +219,8 @@ class PoseTracker:
         step = odometry.previous_from_body
         if step is None:
             step = np.eye(4) if before is None else se3_inverse(before) @ odometry.odom_from_body
+        confirmed = self.confirmed
+        earlier = None if confirmed is None else confirmed.now
         for hypothesis in self._tracked():
             hypothesis.propagate(motions, odometry, step, self.settings)
             hypothesis.has_broken |= has_broken
@@ -226,12 +228,20 @@ class PoseTracker:
             hypothesis.missed |= step_ns > _MISSED_STEPS * self._period_ns
             if change is not None:
                 hypothesis.history.redefine_odom(change)
+        if confirmed is not None and earlier is not None:
+            self._keep_error(confirmed, earlier)
         if change is not None:
             self.candidates.redefine_odom(change)
         self.odom_from_body = odometry.odom_from_body
         self.step_m = length(step[:3, 3])
         if self.prior is not None:
             self.prior.travelled_m += self.step_m
+
+    def _keep_error(self, confirmed: PoseHypothesis, earlier: Place) -> None:
+        """Add to a pose that comes from an earlier place by how much the map is worse there than here, and than an unmeasured one."""
+        here, kept = np.maximum(self.maps.map_cov(confirmed.now), UNKNOWN_COV), (confirmed.start, confirmed.now)
+        more = np.maximum(self.maps.map_cov(earlier) - here, 0.0)
+        confirmed.start, confirmed.now = (at._replace(cov_rot_trans=at.cov_rot_trans + more) for at in kept)
 
     def _tracked(self) -> list[PoseHypothesis]:
         found = self.candidates.tracked() + self._repeated.tracked()
@@ -375,6 +385,7 @@ class PoseTracker:
             return QueryResult(None, reason, innovation, off_m if is_near else None)
         self.confirmed = PoseHypothesis.at_query(self._query_frame, confirmed.then.updated(self.place_by(fix)))
         self.confirmed.support = confirmed.support + 1
+        self._keep_error(self.confirmed, self.confirmed.start)
         self.candidates.reset()
         return QueryResult(fix, "", innovation, off_m)
 

@@ -51,6 +51,7 @@ class ProtectionMonitor:
     def _reset(self) -> None:
         self._bank, self._log_odds, self._fix_ns, self._tracker.followed = core.ProtectionBank(), 0.0, 0, None
         self._is_refused = False  # the last fix contradicts the pose
+        self._cov_map = np.zeros((6, 6))  # of the map's own error at the last fix
 
     def handle(self, result: QueryResult) -> None:
         """Use the map query that finished with this frame, if any did."""
@@ -69,16 +70,17 @@ class ProtectionMonitor:
             self._is_refused |= result.innovation is not None
             self._log_odds -= 0.0 if way is None else evidence
             return
-        self._fix_ns, self._is_refused = stamp_ns, False
+        place, self._fix_ns, self._is_refused = tracker.place_by(fix), stamp_ns, False
+        self._cov_map = tracker.maps.map_cov(place)
         if way is not None and not is_other_viewpoint(way.then.map_from_body):
             self._bank.repeat()
             return
-        matched, place, camera = fix.matched, tracker.place_by(fix), fix.matched.camera
+        matched, camera = fix.matched, fix.matched.camera
         measured = matched.points_source, matched.pixels, 1.0 / matched.sigmas_px
-        points, pixels, weights = map(np.ascontiguousarray, measured)
         others = [] if fix.covisible is None else [fix.covisible.points_map[~fix.covisible.is_found]]
-        middle = middle_of(np.concatenate([points, *others]), place.map_from_body @ tracker.body_from_cam)
-        seen = points, pixels, weights, camera.lens, REFINEMENT, middle
+        due = np.concatenate([matched.points_source, *others])  # should be in view
+        middle = middle_of(due, place.map_from_body @ tracker.body_from_cam)
+        seen = *map(np.ascontiguousarray, measured), camera.lens, REFINEMENT, middle
         moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
         base_z_m = float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2])
         placed = place.map_from_body, tracker.body_from_cam, (camera.width_px, camera.height_px), base_z_m
@@ -93,7 +95,7 @@ class ProtectionMonitor:
             if (prior := tracker.confirmed_by) is not None:
                 self._log_odds -= log(settings.wrong_prior_share if prior.is_revisable else settings.protection_risk)
         # However much was seen before, as many failed looks as tell of a robot that was carried end the level.
-        most = settings.kidnap_fixes * look - log(settings.protection_risk)
+        most = (settings.kidnap_fixes - 0.5) * look - log(settings.protection_risk)
         self._log_odds = min(self._log_odds + looks * evidence, most)
 
     def judged(self, estimate: Estimate) -> Estimate:
@@ -109,7 +111,7 @@ class ProtectionMonitor:
         if is_late or is_doubted or self._log_odds < -log(risk):
             return estimate
         here, since, cov_since = map(np.ascontiguousarray, (map_from_body, *way.now[:2]))
-        cov_map = tracker.maps.map_cov(confirmed.now)
+        cov_map = np.maximum(self._cov_map, tracker.maps.map_cov(confirmed.now))
         level_m, level_rad = self._bank.level(here, since, cov_since, cov_map, self._base_point, risk)
         drifts = [drift for drift in estimate.calibration.drifts if abs(drift.value) > _MOVED_SIGMAS * drift.sigma]
         moved = {drift.parameter: abs(drift.value) for drift in drifts}

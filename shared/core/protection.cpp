@@ -24,6 +24,7 @@ constexpr double kForgottenS = 20.0;                          // after a group w
 constexpr double kCellM = 2.0, kLowM = 1.0;                   // squares of the map; the height above the base that divides it
 constexpr int kZoneCells = 3;                                 // a zone's side: wherever a stretch of 4 m lies, one zone holds it
 constexpr double kBendM = 0.04, kBendRad = 0.005;             // sigmas of a bend: what odometry drifts along 8 m
+constexpr double kAgrees = 0.4;                               // of its level: beyond, a mode certainly contradicts the pose
 constexpr int kColumns = 4, kRows = 3;                        // parts of the image
 constexpr double kNearest = 0.05;                             // metres before the camera
 constexpr double kFarthest = 1e7;                             // metres, and pixels
@@ -233,13 +234,15 @@ class ProtectionBank {
       Mat6 total = cov_map;
       for (int k = 0; k < 36; ++k) total.at[k] += kOverbound * moved.covariance.at[k];
       double own_m = 0.0, own_rad = turned_rad + factor * widest(mat3(total.at, 6));
+      bool may_agree = turned_rad < kAgrees * own_rad;
       for (const Vec3 lever : {Vec3{}, point}) {
-        const double of_point_m = norm(here * lever - end * lever) + factor * widest(mat3(about(total, end.rotation * lever).at + 21, 6));
+        const double apart_m = norm(here * lever - end * lever);
+        const double of_point_m = apart_m + factor * widest(mat3(about(total, end.rotation * lever).at + 21, 6));
         if (!std::isfinite(of_point_m + own_rad)) return {kUnknown, kUnknown};
-        own_m = std::max(own_m, of_point_m);
+        own_m = std::max(own_m, of_point_m), may_agree &= apart_m < kAgrees * of_point_m;
       }
       if (group.what == Without::kNothing) clean_m = own_m, clean_rad = own_rad;
-      if (group.what == Without::kHeight || group.what == Without::kZone)
+      if ((group.what == Without::kHeight || group.what == Without::kZone) && may_agree)  // else what it lacks is no bend
         own_m = std::min(own_m, clean_m + factor * kBendM), own_rad = std::min(own_rad, clean_rad + factor * kBendRad);
       level_m = std::max(level_m, own_m), level_rad = std::max(level_rad, own_rad);
     }

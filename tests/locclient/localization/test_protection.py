@@ -10,6 +10,8 @@ from scipy.stats import chi
 from benchmarks.robot.bench_protection import FAULTS, MAP_SIGMAS, RISK, Drive, judged
 from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.mapformat.map_errors import ErrorSigmas, MapErrors
+from fleetmap.messages import Status
 from fleetmap.pnp.pnp import REFINEMENT, Correspondences
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
@@ -169,6 +171,26 @@ def test_a_robot_that_stands_has_a_level_once_it_was_told_its_place(robot: Seein
     robot.localizer.forget_pose()
     robot.told(0.1)
     assert [estimate.protection_m < 0.5 for estimate in robot.ride(8, 0.0, [off(0.0)])][-1]
+
+
+def test_failed_looks_end_a_level_however_long_the_robot_was_right(robot: Seeing) -> None:
+    levels_m(robot, 100)
+    failed = [robot.go(0.6, NO_FIX) for _ in range(4)]  # the first one is of the look before
+    assert all(estimate.status is Status.TRACKING for estimate in failed)
+    assert [estimate.protection_m < 0.5 for estimate in failed] == [True, True, True, False]
+
+
+def test_what_the_map_says_of_a_place_holds_until_fixes_of_the_next_one(robot: Seeing) -> None:
+    robot.told(0.1)
+    maps, wide = robot.localizer.maps, {(x, y): ErrorSigmas(0.002, 0.1, 0.1) for x in (2, 3) for y in (-2, -1)}
+    own = {(x, y): ErrorSigmas(0.002, 0.002, 0.002) for x in range(9) for y in range(-9, 9)}
+    maps.by_floor[""] = maps.by_floor[""]._replace(errors=MapErrors(4.0, own | wide))
+    for step in range(70):
+        is_wide = tuple(np.floor((robot.map_from_body @ [0.15 * (step > 0), 0, 0, 1])[:2] / 4.0)) in wide
+        told = robot.go(0.15, [off(0.1 * is_wide)], turn_rad=0.0)
+        if told.protection_m < np.inf:
+            assert robot.error_m(told) < min(told.protection_m, 4.0 * np.sqrt(told.cov_rot_trans[3, 3]))
+        assert step < 12 or told.status is Status.TRACKING
 
 
 def test_odometry_that_went_astray_within_its_covariance_ends_no_level(robot: Seeing) -> None:
