@@ -21,6 +21,7 @@ _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
 _REACH, _NOISE_RADPS = 4.0, 0.01  # in typical deviations; intervals beyond are outliers, such as people in the picture
 _LACK, _LACK_SIGMAS = 0.3, 4.0  # share of the gyro's turns about an axis
+_QUIET_RADPS = 0.002  # sigma of slow errors of a gyro, which the differences of its samples do not show
 _PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not drift by half a frame within seconds
 
 
@@ -107,9 +108,8 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     signed = max(good, key=lambda axes: float(np.trace(axes)), default=None)
     span_s = float(np.median(turns.ends_ns - turns.starts_ns)) * 1e-9
     noise = 0.5 * float(np.diff(imu.gyro_radps, axis=0).var(axis=0).max()) * median_period_s(imu.stamps_ns) / span_s
-    unseen = (
-        _unseen(turned / scale, seen, noise) if np.isfinite(turns.ways_m).any() else {}
-    )  # one camera takes ways for turns
+    # One camera takes ways for turns.
+    unseen = _unseen(turned / scale, seen, max(noise, _QUIET_RADPS**2)) if np.isfinite(turns.ways_m).any() else {}
     parts = []
     for part in np.array_split(np.arange(len(all_seen)), _PARTS):
         if len(part) < _MIN_PAIRS or float(np.sqrt(all_seen[part].var(axis=0).sum())) <= _LEAST_RATE_RADPS:
@@ -124,7 +124,7 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
 def _unseen(gyro: Array, seen: Array, noise: float) -> dict[str, float]:
     """Return by axis of the body how much of the gyro's rates (K, 3) the images' show, where they certainly lack some: two drives along
     one way have the same turns, but not what the ground does to the robot. noise: variance of the gyro's rates."""
-    inverse = np.linalg.pinv(gyro.T @ gyro)
+    inverse = np.linalg.inv(gyro.T @ gyro + 1e-6 * len(gyro) * noise * np.eye(3))  # also where an axis never turns
     shares, spreads = inverse @ gyro.T @ seen, inverse.diagonal()
     sigmas = np.sqrt(spreads * (seen - gyro @ shares).var(axis=0))
     lacking = 1.0 - len(seen) * spreads * noise - shares.diagonal() > np.maximum(_LACK, _LACK_SIGMAS * sigmas)

@@ -253,6 +253,15 @@ def test_a_robot_that_turns_about_one_axis_only() -> None:
     assert wrong.offset_s == pytest.approx(0, abs=0.003)
 
 
+@pytest.mark.parametrize(("sigma_radps", "verdict"), [(0.0015, Verdict.OK), (0.01, Verdict.FAIL)])
+def test_slow_errors_of_a_gyro_are_no_other_drive(sigma_radps: float, verdict: Verdict) -> None:
+    """On an even floor a low-passed gyro turns by nothing else about its quiet axes."""
+    turns, imu = shaken(1)
+    turns.ways_m[:] = 0.0
+    imu.gyro_radps[:, 0] += 1.4 * sigma_radps * np.sin(30e-9 * imu.stamps_ns)
+    assert gyro_found(turns, imu)["gyro axes"].verdict is verdict
+
+
 @pytest.mark.parametrize("axes", [1, 3])
 def test_a_person_before_the_cameras_is_no_fault_of_the_gyro(axes: int) -> None:
     """Two fifths of the run the images show somebody who stands still before them."""
