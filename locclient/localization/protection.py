@@ -23,6 +23,7 @@ from locclient.localization.settings import TrackSettings
 # not independent. One that matches twice as well counts as two looks at most, by an exponential tail. Of starts, those beside the map.
 _WRONG_SHARE, _LEAST_SHARE, _MOST_LOOKS, _OUTSIDE_SHARE = 0.05, 0.02, 2.0, 0.05
 _LOOK_M = 0.5  # between looks
+_LOW_M, _FEW_SHARE, _EVEN_SHARE = 1.0, 0.1, 0.8  # above the base; of all in view; of the share found
 _MOVED_SIGMAS = 3.0  # of a parameter of the mounting, from which on it counts
 _MOUNTING = PARAMETERS[TILT.start : HEIGHT]
 
@@ -32,6 +33,13 @@ def middle_of(points_map: Array, map_from_cam: Array) -> Array:
     x, y, z = transform_points(se3_inverse(map_from_cam), points_map).T
     places = np.array([x, y, z * z])[:, z > 0.0] / z[z > 0.0]
     return np.median(places, axis=1) if places.size else np.zeros(3)
+
+
+def is_even(due_map: Array, found: int, base_z_m: float) -> bool:
+    """Return False if of points (N, 3) that should be in view, the first ones found, low or high ones were missed much more than all."""
+    low, is_found = due_map[:, 2] < base_z_m + _LOW_M, np.arange(len(due_map)) < found
+    halves = [is_found[half] for half in (low, ~low) if half.mean() > _FEW_SHARE]
+    return all(half.mean() > _EVEN_SHARE * is_found.mean() for half in halves)
 
 
 class ProtectionMonitor:
@@ -80,11 +88,13 @@ class ProtectionMonitor:
         others = [] if fix.covisible is None else [fix.covisible.points_map[~fix.covisible.is_found]]
         due = np.concatenate([matched.points_source, *others])  # should be in view
         middle = middle_of(due, place.map_from_body @ tracker.body_from_cam)
-        seen = *map(np.ascontiguousarray, measured), camera.lens, REFINEMENT, middle
+        points, pixels, weights = map(np.ascontiguousarray, measured)
+        seen = points, pixels, weights, camera.lens, REFINEMENT, middle
         moved = map(np.ascontiguousarray, (ORIGIN if way is None else way.then)[:2])
         base_z_m = float((place.map_from_body[:3, :3] @ self._base_point)[2] + place.position_m[2])
         placed = place.map_from_body, tracker.body_from_cam, (camera.width_px, camera.height_px), base_z_m
-        self._bank.update(*seen, *placed, 1e-9 * stamp_ns, *moved)
+        known = is_even(due, len(matched.points_source), base_z_m), 1e-9 * stamp_ns
+        self._bank.update(*seen, *placed, *known, *moved)
         tracker.followed = asked
         looks = 1.0 if way is not None else min(confirmed.support, 1.0 + confirmed.travelled_m // _LOOK_M)
         if lookalikes is not None:

@@ -152,10 +152,11 @@ class ProtectionBank {
  public:
   // Moves all modes to a fix, by the way of the body since the last one, and updates them by its matches. middle: medians of x / z, y / z
   // and z in the camera of all that should be in view, matched or not: that of the matches moves into a fault that costs the others.
+  // is_even: neither what is low nor what is high was missed far more than the other, as where one of them has moved.
   void update(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& limits, Vec3 middle,
-              const SE3& fix, const SE3& body_from_cam, const std::tuple<double, double>& size_px, double base_z_m, double stamp_s,
-              const SE3& way, const Mat6& cov_way) {
-    modes_.erase({Without::kFix}), modes_.erase({Without::kAllBefore});
+              const SE3& fix, const SE3& body_from_cam, const std::tuple<double, double>& size_px, double base_z_m, bool is_even,
+              double stamp_s, const SE3& way, const Mat6& cov_way) {
+    is_even_ = is_even, modes_.erase({Without::kFix}), modes_.erase({Without::kAllBefore});
     std::erase_if(modes_, [&](const auto& each) { return stamp_s - each.second.seen_s > kForgottenS; });
     for (auto& [_, mode] : modes_) move(mode, way, cov_way);
     Mode anywhere{fix, {}, stamp_s};
@@ -242,7 +243,7 @@ class ProtectionBank {
         own_m = std::max(own_m, of_point_m), may_agree &= apart_m < kAgrees * of_point_m;
       }
       if (group.what == Without::kNothing) clean_m = own_m, clean_rad = own_rad;
-      if ((group.what == Without::kHeight || group.what == Without::kZone) && may_agree)  // else what it lacks is no bend
+      if (((group.what == Without::kHeight && is_even_) || group.what == Without::kZone) && may_agree)  // else it is no bend
         own_m = std::min(own_m, clean_m + factor * kBendM), own_rad = std::min(own_rad, clean_rad + factor * kBendRad);
       level_m = std::max(level_m, own_m), level_rad = std::max(level_rad, own_rad);
     }
@@ -251,6 +252,7 @@ class ProtectionBank {
 
  private:
   std::map<Group, Mode> modes_;
+  bool is_even_ = true;               // the last fix
   std::map<double, double> factors_;  // by the risk's share over its prior
 };
 
@@ -260,7 +262,7 @@ void bind_protection(nb::module_& module) {
   nb::class_<Shared<ProtectionBank>>(module, "ProtectionBank")
       .def(nb::init<>())
       .def("update", in_turn<PythonLock::kReleased>(&ProtectionBank::update), "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a,
-           "middle"_a, "map_from_body"_a, "body_from_cam"_a, "size_px"_a, "base_z_m"_a, "stamp_s"_a, "way"_a, "cov_way"_a)
+           "middle"_a, "map_from_body"_a, "body_from_cam"_a, "size_px"_a, "base_z_m"_a, "is_even"_a, "stamp_s"_a, "way"_a, "cov_way"_a)
       .def("repeat", in_turn(&ProtectionBank::repeat))
       .def("level", in_turn(&ProtectionBank::level), "map_from_body"_a, "way"_a, "cov_way"_a, "cov_map"_a, "point"_a, "risk"_a);
 }

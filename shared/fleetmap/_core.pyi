@@ -142,13 +142,14 @@ class ProtectionBank:
         body_from_cam: _Reals,
         size_px: tuple[float, float],
         base_z_m: float,
+        is_even: bool,
         stamp_s: float,
         way: _Reals,
         cov_way: _Reals,
     ) -> None:
         """Update by a fix, map_from_body (4, 4), and its matches as of refine_pnp. way (4, 4): of the body since the last fix, with its
         covariance (6, 6) about its end. middle (3,): of x / z, y / z and z in the camera, of all landmarks that should be in view.
-        base_z_m: height of the robot's base in the map."""
+        base_z_m: height of the robot's base in the map. is_even: low and high ones of them were matched alike, as of `is_even`."""
 
     def repeat(self) -> None:
         """Count another fix from the viewpoint of the last one that agrees with it: no fault of one fix alone."""

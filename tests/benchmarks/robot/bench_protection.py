@@ -20,7 +20,7 @@ from fleetmap.pnp.pnp import GATE_SQUARED, REFINEMENT, Correspondences, refine_p
 from fleetmap.sensors.rectification import StereoCamera
 from fleetsim.recorder import Order
 from locclient.localization.place import ORIGIN, Place, boxminus, boxplus
-from locclient.localization.protection import middle_of
+from locclient.localization.protection import is_even, middle_of
 from support.estimator.simulated_run import EstimatorSession, unpictured
 from support.estimator.statistics import FeatureStatistics
 
@@ -159,7 +159,8 @@ def judged(
         mapped, pixels, sigmas_px = _measured(drive, frame, rng, fault, size, at)
         mapped, cam_from_map = mapped + bend(mapped), se3_inverse(place.map_from_body @ drive.body_from_cam)
         off = drive.camera.pixel_from_point(transform_points(cam_from_map, mapped)) - pixels
-        matches = Correspondences(drive.camera, mapped, pixels, sigmas_px).take(np.hypot(*off[:, :2].T) < _RADIUS_PX)
+        is_near = np.hypot(*off[:, :2].T) < _RADIUS_PX
+        matches = Correspondences(drive.camera, mapped, pixels, sigmas_px).take(is_near)
         found, is_known = refine_pnp(matches, cam_from_map), False
         if found is None or (found.squared < GATE_SQUARED).sum() < _LEAST:
             continue
@@ -178,6 +179,7 @@ def judged(
             drive.body_from_cam,
             size_px,
             0.0,
+            is_even(mapped[np.argsort(~is_near)], int(is_near.sum()), 0.0),
             0.4 * frame,
             moved,
             cov_moved,

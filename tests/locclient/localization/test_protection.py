@@ -63,6 +63,7 @@ def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
         BODY_FROM_CAM,
         (640, 480),
         0.0,
+        True,
         0.0,
         *still,
     )
@@ -120,6 +121,14 @@ def test_no_error_is_beyond_its_level(fault: str) -> None:
         assert (error_m < level_m).all() and (error_rad < level_rad).all()
         if fault == "none":
             assert len(error_m) > 80 and np.median(level_m) < 0.15 and np.median(error_m / level_m) > 0.05
+
+
+def test_all_that_hangs_high_may_move_farther_than_a_map_bends() -> None:
+    error_m, level_m, *_ = np.concatenate(
+        [judged(aisle(), np.random.default_rng([913, n]), "all above a metre", 0.25) for n in range(12)]
+    ).T
+    assert error_m.max() > 0.25
+    assert (error_m < level_m).all()
 
 
 def test_a_level_without_one_of_its_parts_does_not_hold() -> None:
