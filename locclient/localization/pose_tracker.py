@@ -219,17 +219,16 @@ class PoseTracker:
         step = odometry.previous_from_body
         if step is None:
             step = np.eye(4) if before is None else se3_inverse(before) @ odometry.odom_from_body
-        confirmed = self.confirmed
-        earlier = None if confirmed is None else confirmed.now
         for hypothesis in self._tracked():
+            earlier = hypothesis.now
             hypothesis.propagate(motions, odometry, step, self.settings)
+            if hypothesis is self.confirmed:
+                self._keep_error(hypothesis, earlier)
             hypothesis.has_broken |= has_broken
             hypothesis.lost_imu |= lost_imu
             hypothesis.missed |= step_ns > _MISSED_STEPS * self._period_ns
             if change is not None:
                 hypothesis.history.redefine_odom(change)
-        if confirmed is not None and earlier is not None:
-            self._keep_error(confirmed, earlier)
         if change is not None:
             self.candidates.redefine_odom(change)
         self.odom_from_body = odometry.odom_from_body

@@ -172,18 +172,9 @@ def judged(
         size_px = drive.camera.width_px, drive.camera.height_px
         here, moved, cov_moved = map(np.ascontiguousarray, (fix.map_from_body, *way[:2]))
         seen = matches.points_source, matches.pixels, 1.0 / matches.sigmas_px, drive.camera.lens, REFINEMENT
-        bank.update(
-            *seen,
-            middle_of(mapped, here @ drive.body_from_cam),
-            here,
-            drive.body_from_cam,
-            size_px,
-            0.0,
-            is_even(mapped[np.argsort(~is_near)], int(is_near.sum()), 0.0),
-            0.4 * frame,
-            moved,
-            cov_moved,
-        )
+        even = is_even(mapped[np.argsort(~is_near)], int(is_near.sum()), 0.0)
+        middle = middle_of(mapped, here @ drive.body_from_cam)
+        bank.update(*seen, middle, here, drive.body_from_cam, size_px, 0.0, even, 0.4 * frame, moved, cov_moved)
         place, way, is_known = place.updated(fix), ORIGIN, True
         if frame > _STARTED:
             count(truth)

@@ -54,21 +54,9 @@ def test_the_level_after_a_fix_is_that_of_its_definition() -> None:
     pixels[::4, 2] = np.nan
     middle = middle_of(aisle(1, 80).points_map[0], fix @ BODY_FROM_CAM)
     bank, still = core.ProtectionBank(), (np.eye(4), np.zeros((6, 6)))
-    given = (
-        np.ones((len(points), 2)),
-        CAMERA.lens,
-        REFINEMENT,
-        middle,
-        fix,
-        BODY_FROM_CAM,
-        (640, 480),
-        0.0,
-        True,
-        0.0,
-        *still,
-    )
+    placed = middle, fix, BODY_FROM_CAM, (640, 480), 0.0, True, 0.0, *still
     assert bank.level(fix, *still, np.eye(6), np.zeros(3), RISK) == (np.inf, np.inf)
-    bank.update(points, pixels, *given)
+    bank.update(points, pixels, np.ones((len(points), 2)), CAMERA.lens, REFINEMENT, *placed)
     assert bank.level(fix, *still, np.eye(6), np.zeros(3), RISK)[0] > 100.0  # that fix may be wrong
     bank.repeat()
 
