@@ -153,9 +153,9 @@ def _story(master: Master, store: MapStore, http: str) -> None:
     assert not master.errors("DUPLICATE_MAP"), "it ends when another action on maps is accepted"
     until(lambda: master.state["mobileRobotPosition"]["localized"] if "mobileRobotPosition" in master.state else False)
     assert not master.errors("LOCALIZATION_ERROR")
+    until(lambda: 0 < master.state["mobileRobotPosition"].get("deviationRange", 9.0) < 1.0, lambda: master.state)
     place = master.state["mobileRobotPosition"]
-    assert 0 < place["deviationRange"] < 0.5
-    assert place["localizationScore"] > 0.8
+    assert place["localizationScore"] == pytest.approx(1.0 - place["deviationRange"] / 3.0)  # lost_radius_m
     assert place["mapId"] == "room"
 
     before = len(master.states)
