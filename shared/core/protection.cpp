@@ -47,11 +47,11 @@ struct Mode {
   double seen_s;
 };
 
-// What matches say of a perturbation of the fix: of each row (u, v, disparity) six derivatives and the residual, whitened, and what they
-// add to normal equations (their lower triangle row by row, the slope); which matches are in a group.
+// What matches say of a perturbation of the fix: of each row (u, v, disparity) six derivatives and the residual, whitened; what a match
+// adds to normal equations (their lower triangle row by row, the slope), and without its disparity; which matches are in a group.
 struct Matches {
   std::vector<double> rows[3][7];
-  std::vector<std::array<double, 28>> products[3];
+  std::vector<std::array<double, 28>> products[2];
   std::map<Group, std::vector<size_t>> members;
 };
 
@@ -99,7 +99,8 @@ void move(Mode& mode, const SE3& way, const Mat6& cov_way) {
 
 // Updates a mode by the matches outside its group: by the perturbation of the fix's pose that minimises the sum of both costs. Which of
 // them are good is judged by the mode's own pose: those chosen at a faulty fix's agree with the fault. Where few are, the mode's
-// odometry went astray, as after a way without fixes, and the fix's pose judges; but few matches alone may lie at the rim of a fault.
+// odometry went astray, as after a way without fixes, and the fix's pose judges; but few matches alone may lie at the rim of a fault,
+// and where few agree with the fix either, they tell the mode nothing.
 void update(const Group& group, Mode& mode, const SE3& fix, Matches& matches, const Refinement& refinement) {
   const Mat6 before = inverse_spd(mode.covariance);
   double off[6], at[6];
@@ -107,8 +108,9 @@ void update(const Group& group, Mode& mode, const SE3& fix, Matches& matches, co
   store(mode.map_from_body.translation - fix.translation, off + 3);
   std::copy_n(off, 6, at);
   const int rows = group.what == Without::kDisparities ? 2 : 3;
+  const auto& products = matches.products[3 - rows];
   const std::vector<size_t>& left_out = matches.members[group];
-  const size_t total = matches.products[0].size(), count = total - left_out.size();
+  const size_t total = products.size(), count = total - left_out.size();
   for (int round = 0, rounds = 2; round < rounds; ++round) {
     std::vector<double> squared(total);
     for (int row = 0; row < rows; ++row) {
@@ -124,11 +126,11 @@ void update(const Group& group, Mode& mode, const SE3& fix, Matches& matches, co
     for (size_t n = 0; n < total; ++n) {
       if (!(squared[n] < refinement.gate_squared)) continue;
       const double robust = 1.0 / (1.0 + squared[n] / (refinement.width * refinement.width)), weight = robust * robust / kWhite;
-      for (int row = 0; row < rows; ++row)
-        for (size_t k = 0; k < sums.size(); ++k) sums[k] += weight * matches.products[row][n][k];
+      for (size_t k = 0; k < sums.size(); ++k) sums[k] += weight * products[n][k];
       ++agreeing;
     }
-    if (round == 0 && 4 * agreeing < count && 4 * count >= total) {
+    if (rounds == 2 + round && 4 * agreeing < count && 4 * count >= total) {
+      if (round == 1) return;
       std::fill_n(at, 6, 0.0), ++rounds;
       continue;
     }
@@ -187,14 +189,15 @@ class ProtectionBank {
       for (const Group& group : groups) matches.members[group].push_back(number);
       for (int k = 0; k < kZoneCells * kZoneCells; ++k)
         matches.members[{Without::kZone, tile(0, kCellM) - k / kZoneCells, tile(1, kCellM) - k % kZoneCells}].push_back(number);
+      for (auto& products : matches.products) products.emplace_back();
       for (int k = 0; k < 3; ++k) {  // where the body turns and shifts, the point moves against it
         const Vec3 by_map = map_from_cam.rotation * by_point[k];
         double numbers[7];
         store(cross(by_map, point - fix.translation), numbers), store(-by_map, numbers + 3), numbers[6] = residual[k];
-        auto& products = matches.products[k].emplace_back();
         for (size_t a = 0, to = 0; a < 7; ++a) {
           matches.rows[k][a].push_back(numbers[a]);
-          for (size_t b = 0; b <= std::min<size_t>(a, 5); ++b) products[to++] = numbers[a] * numbers[b];
+          for (size_t b = 0; b <= std::min<size_t>(a, 5); ++b, ++to)
+            for (int set = 0; set < std::min(2, 3 - k); ++set) matches.products[set][number][to] += numbers[a] * numbers[b];
         }
       }
     }

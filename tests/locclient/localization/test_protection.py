@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi
 
-from benchmarks.robot.bench_protection import FAULTS, MAP_SIGMAS, RISK, Drive, judged
+from benchmarks.robot.bench_protection import FAULTS, MAP_SIGMAS, RISK, Drive, drive_of, judged
 from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.mapformat.map_errors import ErrorSigmas, MapErrors
@@ -116,6 +116,13 @@ def test_all_that_hangs_high_may_move_farther_than_a_map_bends() -> None:
         [judged(aisle(), np.random.default_rng([913, n]), "all above a metre", 0.25) for n in range(12)]
     ).T
     assert error_m.max() > 0.25
+    assert (error_m < level_m).all()
+
+
+def test_matches_that_agree_with_neither_pose_draw_no_filter_along() -> None:
+    drive = drive_of("identical-aisles", 1701)  # with gaps of ten seconds, in which few fixes pass
+    error_m, level_m, *_ = judged(drive, np.random.default_rng([1701, 156]), "far half", 0.1).T
+    assert error_m.max() > 0.11
     assert (error_m < level_m).all()
 
 
