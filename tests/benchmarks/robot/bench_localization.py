@@ -9,8 +9,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import psutil
@@ -21,6 +23,7 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status, robot_key
 from locclient.localization.place import boxminus
+from locclient.localization.protection import ProtectionMonitor
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_result import ReplayResult
@@ -34,7 +37,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "opposite direction": ("--robot", "opposite-1", "--day", "1"),
     "another site": ("--robot", "runner-1", "--day", "1", "--seed", "1"),
 }
-_GOOD_M = 0.1
+_GOOD_M, _LEVEL_PAIRS = 0.1, 5
 _UNSURE = (Status.LOST, Status.AMBIGUOUS)
 
 
@@ -100,13 +103,36 @@ def process_figures(recording: Path, store: Path) -> dict[str, float | None]:
     return {"first_estimate_cpu_s": at_reference(first_s[0], [slowness()]), "rss_mb": max(rss_mb)}
 
 
-@benchmark([*CASES, "process"], seed=0)
+def level_figures(recording: Path, store: Path) -> dict[str, float | None]:
+    """What the protection level adds to a frame's mean CPU ms: the median over pairs of replays, one with it and one without."""
+    without = patch.multiple(ProtectionMonitor, handle=lambda *_: None, judged=lambda _, estimate: estimate)
+
+    def mean_ms(*, is_judged: bool) -> float:
+        with nullcontext() if is_judged else without:
+            return 1e3 * float(
+                np.mean([f.cpu_s for f in played(recording, store).frames[run_metrics.WARM_UP_FRAMES :]])
+            )
+
+    mean_ms(is_judged=True)  # loads what computes
+    slow, more_ms = [slowness()], []
+    for pair in range(_LEVEL_PAIRS):
+        taken = {is_judged: mean_ms(is_judged=is_judged) for is_judged in (pair % 2 == 0, pair % 2 == 1)}
+        more_ms.append(taken[True] - taken[False])
+    slow.append(slowness())
+    median_ms = float(np.median(more_ms))
+    return {"more_ms": median_ms, "more_ms_at_reference": at_reference(median_ms, slow), "slowness": mean_of(slow)}
+
+
+@benchmark([*CASES, "process", "level"], seed=0)
 def main(arguments: Options) -> Results:
     seed, found = arguments.seed, {}
     store = surveyed(arguments.work, seed or None)
     if "process" in arguments.only:
         arguments.only.remove("process")
         found["process"] = process_figures(recorded(arguments.work, CASES["next day"]), store)
+    if "level" in arguments.only:
+        arguments.only.remove("level")
+        found["level"] = level_figures(recorded(arguments.work, CASES["next day"]), store)
     for name in arguments.only:
         recording = recorded(arguments.work, (("--seed", str(seed)) if seed else ()) + CASES[name])
         played(recording, store, ":60")
