@@ -26,6 +26,7 @@ from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.version_trial import TrialSettings, VersionTrials
 
 Clock = Callable[[], float]  # seconds
+_IMU_SILENT, _SILENT_NS = "imu_silent", 1_000_000_000  # longer than samples of a sound IMU are on their way
 _MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
 
 
@@ -33,7 +34,8 @@ class FailureContext(NamedTuple):
     """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
     unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
-    cut: recording of the seconds around its onset, None without one. flags, dropped_share: as of `Outcome`.
+    cut: recording of the seconds around its onset, None without one. flags: `left_out` of `Outcome`, and an IMU that has fallen silent;
+    dropped_share: as of `Outcome`.
     """
 
     failure: Failure
@@ -42,7 +44,7 @@ class FailureContext(NamedTuple):
     evidence: Evidence
     running: LoadedMap | None
     cut: FailureCut | None = None
-    flags: tuple[Flag, ...] = ()
+    flags: tuple[str, ...] = ()
     dropped_share: float = 0.0
 
 
@@ -115,6 +117,7 @@ class Robot:
         self._wheels = motion_checks.WheelAgreement(calibration.base_from_body)
         self._views = motion_checks.ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
+        self._imu_ns: int | None = None  # of the last sample
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
@@ -210,6 +213,7 @@ class Robot:
     def _take_samples(self, bundle: SensorBundle) -> Sequence[WheelSample]:
         """Pass on what arrived beside the frame, and return the samples of wheels that may be used."""
         self.localizer.handle_imu(bundle.imu)
+        self._imu_ns = int(bundle.imu.stamps_ns[-1]) if len(bundle.imu) else self._imu_ns
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
         wheel = [] if self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault else bundle.wheel
@@ -262,8 +266,9 @@ class Robot:
         failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.open.get(FailureKind.NOT_FOUND, onset)
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
-        flags, dropped_share = tuple(self._left_out()), self._load.dropped_share
-        return FailureContext(failure, onset, unmatched, evidence, self.running, cut, flags, dropped_share)
+        is_silent = self._imu_ns is not None and failure.estimate.stamp_ns - self._imu_ns > _SILENT_NS
+        flags = (*([_IMU_SILENT] if is_silent else []), *self._left_out())
+        return FailureContext(failure, onset, unmatched, evidence, self.running, cut, flags, self._load.dropped_share)
 
     def _show(self, loaded: LoadedMap) -> None:
         if self.ring is not None and not self._site:

@@ -303,7 +303,7 @@ class FailureEvidence(msgspec.Struct, frozen=True, array_like=True):
     expected landmarks: x and y in cells from the robot's believed one, and its expected and seen landmarks. usual_percent of the expected
     landmarks were seen until then, 0 if unknown. places: where fixes agree: x and y in `map` in centimetres, number of fixes, and percent
     of the landmarks expected there that they found. broke: all tracks were lost between two good images. dropped_percent of the last
-    seconds' frames. flags: sensors left out, and overload.
+    seconds' frames. flags: `imu_silent`, sensors left out, and overload.
     """
 
     view_percent: _Count

@@ -164,6 +164,9 @@ def case_of(name: str, rng: Random, shared: Random, first: int, others: tuple[in
         return Case("robot", turn=so3_exp(rng.choice([-1.0, 1.0], 3) * np.radians(rng.uniform(0.3, 3.0, 3))), **aids)
     if name == "pushed IMU":
         return Case("robot", has_wheels=False, dropped=-begins)
+    if name == "lost IMU":  # by which a robot without wheels does not survive a darkness that it usually does
+        dark_s = begins + 1.5, begins + 1.5 + float(rng.uniform(1.0, 3.0))
+        return Case("robot", (Fault("imu-gap", begins, begins + 60.0), Fault("camera-dark", *dark_s)), has_wheels=False)
     changed = (*others, first) if rng.random() < 0.5 else others
     if name == "restocked":
         return Case("building", share=float(rng.choice([0.96, 1.0])), changed=changed, **aids)
@@ -179,7 +182,7 @@ def case_of(name: str, rng: Random, shared: Random, first: int, others: tuple[in
 LOOKALIKES = "identical aisle", "unmapped look-alike"
 OWN = "dark camera", "dirty camera", "overload", "carried", "wrong calibration", "pushed IMU"
 TRUTHS = dict.fromkeys(OWN, "robot") | dict.fromkeys(("restocked", "racks moved"), "building")
-TRUTHS |= dict.fromkeys(LOOKALIKES, "lookalike")
+TRUTHS |= dict.fromkeys(LOOKALIKES, "lookalike") | {"lost IMU": "robot"}
 CAUSES = tuple(TRUTHS)
 
 

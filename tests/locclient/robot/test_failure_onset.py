@@ -13,6 +13,7 @@ from fleetmap.geometry import se3
 from fleetmap.messages import Cause, FailureKind, FailureReport, Status
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.image_quality import ImageQuality
@@ -147,6 +148,17 @@ def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: Ma
     left = robot_world.rectifier().rectify(list(robot_world.bundles(75))[-1].frame).left
     there = cv2.resize(left, shown[1].shape[::-1], interpolation=cv2.INTER_AREA).astype(float)
     assert np.abs(shown[1] - shown[2]).mean() > 3 * np.abs(shown[1] - there).mean(), "half a second before it was there"
+
+
+@pytest.mark.parametrize(("last", "flags"), [(62, ("imu_silent",)), (110, ())])
+def test_an_imu_that_fell_silent_is_evidence(store: MapStore, last: int, flags: tuple[str, ...]) -> None:
+    """A robot in the dark, whose IMU sends its last samples with one of the frames."""
+    bundles = list(robot_world.bundles(110))
+    black, none = np.zeros_like(bundles[0].frame.left), ImuSamples.empty()
+    dark = [replace(each, frame=replace(each.frame, left=black, right=black)) for each in bundles[62:]]
+    sent = [*bundles[:62], *dark]
+    sent = [each if n < last else replace(each, imu=none) for n, each in enumerate(sent)]
+    assert [report.evidence.flags for report in reported(robot_world.new_robot(store), sent)] == [flags]
 
 
 def test_a_changed_map_is_named(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,13 +2,15 @@
 
 from collections import Counter
 from math import inf, nan
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.robot.bench_verdicts import fitted, kept
+from benchmarks.robot.bench_verdicts import fitted, kept, main
 from benchmarks.robot.failed_robots import TRUTHS
+from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureEvidence, FailureReport, Placement
 from mapserver.plugins.failure_verdicts import model
 from mapserver.plugins.failure_verdicts.model import SAYS, WEIGHTS, verdict
@@ -55,12 +57,17 @@ def test_whatever_a_robot_sends_gives_probabilities(of: int, place_m: float) -> 
 
 
 def test_the_weights_are_those_of_the_kept_failures() -> None:
-    np.testing.assert_allclose(WEIGHTS, fitted(*kept()), atol=0.01)
+    np.testing.assert_allclose(WEIGHTS, fitted(*kept()[:2]), atol=0.01)
+
+
+def test_sites_of_the_fit_are_not_judged() -> None:
+    with pytest.raises(UsageError, match=r"fitted on failures of sites \[901, 902\]: judge others"):
+        main(SimpleNamespace(fit=0, seed=899, sites=4))
 
 
 def test_verdicts_on_the_kept_failures_are_of_use(monkeypatch: pytest.MonkeyPatch) -> None:
     said = Counter[str]()
-    for cause, found in zip(*kept(), strict=True):
+    for cause, found in zip(*kept()[:2], strict=True):
         monkeypatch.setattr(model, "figures", lambda *_, found=found: found.tolist())
         says = verdict(REPORT).says
         said["right" if says == TRUTHS[cause] else "unknown" if says == "unknown" else "wrong"] += 1
