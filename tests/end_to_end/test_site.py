@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ import pytest
 from fleetmap.errors import LinkError
 from fleetmap.mapformat.names import blob_path
 from locclient.cli import app as locclient_app
+from locclient.maps.map_source import LocalMapSource
 from mapserver.cli import app as mapserver_app
-from mapserver.store import MapStore
+from mapserver.store import DraftContent, DraftDetails, MapStore
 from support.fleet.dashboard_scene import serving
 from support.room_site import FRAMES, KNOWN_RIG, RoomSite, process, run
 from support.waiting import eventually
@@ -145,3 +147,18 @@ def test_over_the_network_the_same_comes_out_and_the_server_sees_the_robot(
     assert (tmp_path / "r.tum").read_bytes() == (replayed[1] / "r.tum").read_bytes(), "in one process and in two"
     assert last["status"] == "TRACKING"
     assert last["metrics"]["localised_share"] == 1.0
+
+
+def test_levels_hold_in_a_published_map_that_is_bent(site: RoomSite, tmp_path: Path) -> None:
+    source, store = LocalMapSource(site.store, "lab"), tmp_path / "store"
+    manifest = source.manifest(source.wanted())
+    details = DraftDetails(**{name: getattr(manifest, name) for name in DraftDetails.__struct_fields__})
+    tiles = source.tiles(manifest)[0].values()
+    bent = [replace(t, points_map=t.points_map + 0.04 * np.sin(t.points_map[:, :1]) * [0.0, 0.0, 1.0]) for t in tiles]
+    with MapStore.open(store, create=True) as server:
+        server.save("lab", DraftContent(bent, source.vocabulary(manifest), details))
+    run(mapserver_app, "publish", "--site", "lab", "--store", store, *KNOWN_RIG)
+    report = site.replay(tmp_path, store=store)
+    assert report["error_m"]["max"] > 0.03
+    assert report["protection"]["beyond_share"] == 0.0
+    assert report["protection"]["available_share"] > 0.5

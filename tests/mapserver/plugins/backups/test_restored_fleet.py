@@ -21,7 +21,7 @@ from support.fleet.tls_site import TlsSite
 from support.storage.map_samples import publish_samples
 from support.waiting import eventually
 
-SITE, WITHIN_S = "lab", 30.0
+SITE, WITHIN_S, LEVEL_M = "lab", 30.0, 0.125
 ROBOTS = [f"tote-{number}" for number in range(30)]
 
 
@@ -32,8 +32,8 @@ def drive(site: TlsSite, name: str, outbox: Outbox, over: threading.Event) -> No
     with connected(address, identity.folder / "tiles") as connection:
         sync = ServerSync(connection, outbox, retry_s=1.0)
         while not over.wait(1.0):
-            now_ns = time.time_ns()
-            sync.health.append(RobotHealth(site=SITE, robot=name, stamp_ns=now_ns, version=1, status="TRACKING"))
+            told = {"robot": name, "stamp_ns": time.time_ns(), "metrics": {"protection_m": LEVEL_M}}
+            sync.health.append(RobotHealth(site=SITE, version=1, status="TRACKING", **told))  # type: ignore[arg-type]
             sync.step()
 
 
@@ -69,7 +69,8 @@ def test_thirty_robots_report_to_a_restored_server(tmp_path: Path) -> None:
             def heard() -> list[str]:
                 rows = ada.get("/v1/robots").json()["items"]
                 failed = {row.robot for row in store.fleet.failures(FailureFilter(site=SITE))}
-                return sorted(row["robot"] for row in rows if row["last_health"] and row["robot"] in failed)
+                rows = [row for row in rows if row["last_health"] and row["robot"] in failed]
+                return sorted(r["robot"] for r in rows if r["last_health"]["metrics"]["protection_m"] == LEVEL_M)
 
             assert eventually(lambda: heard() == sorted(ROBOTS), WITHIN_S)
     finally:
