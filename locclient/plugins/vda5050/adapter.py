@@ -11,6 +11,7 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Status, WantedVersion
@@ -287,9 +288,9 @@ class FleetAdapter:
             return
         action, wanted, until_s = pending
         section, words = self._section, "the robot is not localized there; check its pose"
-        if now.is_localized and not now.is_silent and now.position is not None:
+        if now.is_localized and not now.is_silent and now.position is not None and now.estimate is not None:
             off_m, off_rad = now.position.away_from(wanted)
-            reach_m = _SIGMAS * section.initial_sigma_m + now.position.radius_m
+            reach_m = _SIGMAS * section.initial_sigma_m + radius_95_m(now.estimate.cov_rot_trans)
             if off_m <= reach_m and off_rad <= _SIGMAS * section.initial_sigma_rad:
                 said_node = "" if self._part is None else self._part.last_node_id
                 self._last_node = parameters(action)["lastNodeId"], said_node

@@ -306,6 +306,13 @@ def test_actions_that_cannot_be_done_fail(kind: str, parameters: dict[str, Any],
     assert {"referenceKey": "actionId", "referenceValue": "a"} in error["errorReferences"]
 
 
+def test_where_no_level_is_promised_a_robot_is_not_everywhere() -> None:
+    adapter = Adapter()
+    adapter._see(seen(position=PLACE._replace(radius_m=np.inf)))
+    state = adapter.ask("initializePosition", x=99, y=2, theta=3, mapId="hall", lastNodeId="n")
+    assert "98.00 m" in state["actionResult"]
+
+
 def test_an_action_that_ends_by_a_fault_of_ours_does_not_run_for_ever() -> None:
     adapter = Adapter()
     with pytest.raises(AttributeError):  # FakeMaps has no download
