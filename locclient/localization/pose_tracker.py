@@ -416,7 +416,7 @@ class PoseTracker:
         yield from candidates.update(observations, self.odom_from_body)
         if not fixes:
             return OUTSIDE_PRIOR if outside else NO_AGREEMENT
-        (best, *_), competitors = candidates.ranking()
+        (best, *_), competitors = candidates.offered()
         if competitors:
             told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))
             return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")

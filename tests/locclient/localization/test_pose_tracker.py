@@ -117,6 +117,21 @@ def test_a_place_that_is_seen_competes_with_the_best_that_is_not() -> None:
     assert competitors([other, best]) == [other]
 
 
+@pytest.mark.parametrize(("travelled_m", "is_open"), [(0.0, True), (1.2, False)])
+def test_a_site_that_is_mapped_as_a_whole_offers_no_place_of_several_before_fixes_support_it(
+    travelled_m: float, is_open: bool
+) -> None:
+    """Seen: a standing robot's first look preferred one aisle of six by 187 matches to 97, and the next one took it back."""
+    best, weak = hypothesis([187], [0.31]), hypothesis([97], [0.19])
+    best.support, best.travelled_m = 3, travelled_m
+    candidates = HypothesisSet(TrackSettings(is_whole_site_mapped=True))
+    candidates.hypotheses = [weak, best]
+    assert candidates.ranking() == ([best, weak], [])
+    assert candidates.offered() == ([best, weak], [weak] if is_open else [])
+    candidates.hypotheses = [best]
+    assert candidates.offered() == ([best], [])
+
+
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
 DRIVEN = se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.5, 0.0, 0.0]))
 
