@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.common.recorded_runs import played, tool
-from benchmarks.robot.bench_real_robots import UNSEEN, robots_map
+from benchmarks.common.recorded_runs import SITE, mapped, played, tool
+from benchmarks.robot.bench_real_robots import MAPPED, UNSEEN, robots_map
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.tum import read_tum
 from fleetmap.sensors.samples import Trajectory
@@ -24,8 +24,10 @@ from mapserver.survey.odometry_pass import FrameChain
 from studies.study import PAGES, Column, Row, between_marks, publish, results, rms, study, table
 from support.recordings.hashes import hashed, tiles_of
 from support.recordings.realdata import DATA
+from support.room_site import KNOWN_RIG
 
 _SHORT_M = 1.0  # of less no share is said
+_OF_KNOWN_RIG = {"median_mm": "robot_median_mm", "localised_share": "localised_share"}
 COMPARISON = PAGES.parent / "comparison.md"
 # What others reach on the same frames, measured by us once, and what their authors print of the whole sequence (docs/studies).
 PEERS = {
@@ -97,6 +99,16 @@ def robots(run: ReplayResult) -> Row:
     }
 
 
+def robots_of_known_rig(path: Path, same_rig: Path) -> Row:
+    """As `robots`, in a map by a rig that another recording, at another site of the same store, surveyed before."""
+    with TemporaryDirectory() as scratch:
+        store = Path(scratch) / "store"
+        for site, recording, frames in (("rig", same_rig, ":"), (SITE, path, MAPPED)):
+            mapped(store, recording, store.with_suffix(".json"), frames=frames, accepted=KNOWN_RIG, site=site)
+        found = robots(played(path, store, UNSEEN))
+    return {f"robot_of_known_rig_{name}": found[key] for name, key in _OF_KNOWN_RIG.items()}
+
+
 def case(name: str) -> Row:
     """All of one recording; what cannot be measured is left out, and said."""
     path, shown = DATA / name, dict(zip(("recording", "peers", "published"), PEERS[name], strict=True))
@@ -107,6 +119,7 @@ def case(name: str) -> Row:
         return row
     if (same := SAME_RIG.get(name)) is not None:
         row["survey_of_known_rig_mm"] = survey(path, DATA / same)["survey_mm"]
+        row |= robots_of_known_rig(path, DATA / same)
     with TemporaryDirectory() as scratch:
         try:
             store = robots_map(Path(scratch), path)
@@ -124,6 +137,7 @@ COLUMNS = [
     Column("survey_of_known_rig_mm", "rig surveyed before", "{:.1f}"), Column("peers", "others, same frames"),
     Column("odometry_mm", "as it drives, not aligned", "{:.0f}"),
     Column("odometry_share", "its end, of the path", "{:.2%}"), Column("robot_median_mm", "robot in the map, not aligned", "{:.1f}"),
+    Column("robot_of_known_rig_median_mm", "rig surveyed before", "{:.1f}"),
     Column("localised_share", "localised", "{:.0%}"), Column("silent", "silent failures"), Column("published", "published, whole sequence"),
 ]  # fmt: skip
 

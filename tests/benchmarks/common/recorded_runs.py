@@ -108,18 +108,21 @@ def surveyed(work: Path, seed: int | None = None, scenario: str = "small-loop") 
     return mapped(work / f"store{name}", recorded(work, options, scenario), work / f"survey{name}.json")
 
 
-def mapped(store: Path, recording: Path, report: Path, *, frames: str = ":", accepted: Sequence[str] = ()) -> Path:
+def mapped(
+    store: Path, recording: Path, report: Path, *, frames: str = ":", accepted: Sequence[str] = (), site: str = SITE
+) -> Path:
     """A store with the map of a recording's frames in the frame of the truth, made where it is not there yet; the build's report.
 
     accepted: options of `mapserver publish`.
     """
-    if not (store / "built").exists():
+    built = store / ("built" if site == SITE else f"built-{site}")
+    if not built.exists():
         store.parent.mkdir(parents=True, exist_ok=True)
-        to_store = ["--site", SITE, "--store", str(store)]
+        to_store = ["--site", site, "--store", str(store)]
         options = ["--frames", frames, "--frame-from-ground-truth", "--report", str(report)]
         subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, *options], check=True)
         subprocess.run([*tool("mapserver"), "publish", *to_store, *accepted], check=True)
-        (store / "built").touch()
+        built.touch()
     return store
 
 
