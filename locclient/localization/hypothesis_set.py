@@ -98,14 +98,6 @@ class HypothesisSet:
             return order, self._competitors(order[0]) if order else []
         return sorted(order, key=lambda h: h is not best), []
 
-    def offered(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
-        """Return the ranking for robots that offer the first one's pose. Where the whole site is mapped, a place that neither enough fixes
-        nor an operator support competes with all others: what one look prefers the next may take back, and an offer counts as a fix."""
-        order, competitors = self.ranking()
-        is_weak = bool(order) and order[0].told_log_odds <= 0.0 and not self.is_supported(order[0])
-        is_open = self._settings.is_whole_site_mapped and is_weak
-        return order, order[1:] if is_open else competitors
-
     def _ranked(self) -> list[PoseHypothesis]:
         """Return the hypotheses, the one with most inliers first."""
         return sorted(self.hypotheses, key=lambda h: -h.inlier_sum)
