@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot parked for eleven months can reconnect
 _ANSWER_S = 20.0
+_LISTENS_S = 5.0  # a server that takes up new robots listens again within that
 _FILES = ("robot.pem", "identity.json", "servers.ca", "root.json")
 _ENROL = "enrol it: `mapserver robots enrol ROBOT --site SITE` on the server, `locclient enrol ROBOT.fleetmap` here"
 
@@ -114,7 +115,7 @@ class RobotIdentity:
         made._write("bundle.pem", given.own.encode())
         made._write("identity.json", to_json(who))
         first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")
-        if fault := handshake_fault(who.endpoint, first):
+        if fault := handshake_fault(who.endpoint, first, _LISTENS_S):
             raise LinkError(f"{who.endpoint}: {fault}")
         with Bus(who.endpoint, tls=first).open() as bus:
             made._ask(bus, given.own.encode())

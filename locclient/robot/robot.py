@@ -8,7 +8,7 @@ from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
-from fleetmap.messages import Cause, FailureKind, Flag, PoseMessage, Status
+from fleetmap.messages import IMU_SILENT, Cause, FailureKind, Flag, PoseMessage, Status
 from fleetmap.odometry.mono.mono_modes import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -26,7 +26,7 @@ from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.version_trial import TrialSettings, VersionTrials
 
 Clock = Callable[[], float]  # seconds
-_IMU_SILENT, _SILENT_NS = "imu_silent", 1_000_000_000  # longer than samples of a sound IMU are on their way
+_SILENT_NS = 1_000_000_000  # longer than samples of a sound IMU are on their way
 _MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
 
 
@@ -34,7 +34,7 @@ class FailureContext(NamedTuple):
     """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
     unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
-    cut: recording of the seconds around its onset, None without one. flags: `left_out` of `Outcome`, and an IMU that has fallen silent;
+    cut: recording of the seconds around its onset, None without one. flags: `left_out` of `Outcome`, and an IMU that is silent;
     dropped_share: as of `Outcome`.
     """
 
@@ -117,7 +117,7 @@ class Robot:
         self._wheels = motion_checks.WheelAgreement(calibration.base_from_body)
         self._views = motion_checks.ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
-        self._imu_ns: int | None = None  # of the last sample
+        self._imu_ns = 0  # of the last sample, by the clock of images
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
@@ -213,7 +213,8 @@ class Robot:
     def _take_samples(self, bundle: SensorBundle) -> Sequence[WheelSample]:
         """Pass on what arrived beside the frame, and return the samples of wheels that may be used."""
         self.localizer.handle_imu(bundle.imu)
-        self._imu_ns = int(bundle.imu.stamps_ns[-1]) if len(bundle.imu) else self._imu_ns
+        if len(bundle.imu):
+            self._imu_ns = int(bundle.imu.stamps_ns[-1]) - int(self._rectifier.imu_minus_cam_s * 1e9)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
         wheel = [] if self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault else bundle.wheel
@@ -266,8 +267,8 @@ class Robot:
         failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.open.get(FailureKind.NOT_FOUND, onset)
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
-        is_silent = self._imu_ns is not None and failure.estimate.stamp_ns - self._imu_ns > _SILENT_NS
-        flags = (*([_IMU_SILENT] if is_silent else []), *self._left_out())
+        is_silent = bool(self._rectifier.calibration.imu) and failure.estimate.stamp_ns - self._imu_ns > _SILENT_NS
+        flags = (*([IMU_SILENT] if is_silent else []), *self._left_out())
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut, flags, self._load.dropped_share)
 
     def _show(self, loaded: LoadedMap) -> None:

@@ -294,6 +294,7 @@ class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _Count = Annotated[int, msgspec.Meta(ge=-(1 << 31), le=1 << 31)]
+IMU_SILENT = "imu_silent"  # of a calibrated IMU, whose last sample is older than a second, or that sent none
 
 
 class FailureEvidence(msgspec.Struct, frozen=True, array_like=True):

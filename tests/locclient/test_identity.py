@@ -1,5 +1,6 @@
 """Where a robot's map comes from, and its identity: enrolment over real TLS, lost answers, renewal; row 37."""
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -93,6 +94,14 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
     assert asks(identity, "r1")
 
 
+def test_a_server_that_takes_up_other_robots_is_waited_for(tmp_path: Path, server: Server) -> None:
+    bundle, is_closed, opens = server.bundle("r1"), threading.Event(), server.bus._open
+    server.bus._open = lambda: [is_closed.set(), time.sleep(0.5), opens()]  # type: ignore[assignment]
+    threading.Thread(target=server.bus.reopen, args=(server.register.access(),)).start()
+    assert is_closed.wait(10.0)
+    assert asks(RobotIdentity.enrol(tmp_path / "identity", bundle), "r1")
+
+
 def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
     folder, bundle = tmp_path / "identity", server.bundle("r1")
     server.answers = False
@@ -117,6 +126,7 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
 
 def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identity_module, "_ANSWER_S", 5.0)
+    monkeypatch.setattr(identity_module, "_LISTENS_S", 0.0)
     bundle = msgspec.json.decode(server.bundle("r1"))
     with pytest.raises(UsageError, match="not an enrolment bundle"):
         RobotIdentity.enrol(tmp_path / "a", b"PK\x03\x04")

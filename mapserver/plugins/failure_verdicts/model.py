@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from math import dist, exp, inf, isfinite, log, log1p
 
-from fleetmap.messages import Cause, FailureEvidence, FailureReport
+from fleetmap.messages import IMU_SILENT, Cause, FailureEvidence, FailureReport
 
 SAYS = {
     "robot": "the robot is wrong",
@@ -66,11 +66,12 @@ def figures(report: FailureReport, evidence: FailureEvidence) -> list[float]:
     fit = min(max((percent for *_, percent in places), default=0) / 100.0 / usual, 1.0)
     apart = any(dist(one[:2], other[:2]) > 100.0 * _NEAR_M for one, other in combinations(places, 2))
     is_far, is_nowhere = float(wrong_m is not None and not is_near), float(wrong_m is None and not apart and is_seen)
+    unseen, is_faulty = 1.0 - evidence.view_percent / 100.0, cause in _SENSOR or set(evidence.flags) - {IMU_SILENT}
     found = [
         float(cause in _IMAGE),
-        # A calibration that fixes contradict blames neither: racks move too
-        float(cause in _SENSOR or bool(evidence.flags)),
-        1.0 - evidence.view_percent / 100.0,
+        # A calibration that fixes contradict blames neither: racks move too. An IMU lacks only where images tell nothing
+        1.0 if is_faulty else unseen * (IMU_SILENT in evidence.flags),
+        unseen,
         float(evidence.broke),
         float(cause == Cause.CARRIED),
         missing,
@@ -120,5 +121,6 @@ def verdict(report: FailureReport, others_here: int = 0, own_elsewhere: int = 0)
     alike = [place for place in places if not dist(place, believed_m) <= _NEAR_M]
     words = SAYS[says] + (f" ({100 * max(p):.0f} %)" if says != "unknown" else "")
     words += f": hardly any of the expected landmarks is seen in {len(missing)} square metres" if missing else ""
+    words += f": {', '.join(evidence.flags).replace('_', ' ')}" if evidence.flags and says == "robot" else ""
     words += f": {' or '.join(f'{x:.1f}, {y:.1f} m' for x, y in alike)}" if alike else ""
     return Verdict(robot, building, lookalike, says, words, alike, missing)

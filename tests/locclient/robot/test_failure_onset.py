@@ -150,8 +150,8 @@ def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: Ma
     assert np.abs(shown[1] - shown[2]).mean() > 3 * np.abs(shown[1] - there).mean(), "half a second before it was there"
 
 
-@pytest.mark.parametrize(("last", "flags"), [(62, ("imu_silent",)), (110, ())])
-def test_an_imu_that_fell_silent_is_evidence(store: MapStore, last: int, flags: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("last", "flags"), [(0, ("imu_silent",)), (62, ("imu_silent",)), (110, ())])
+def test_a_silent_imu_is_evidence(store: MapStore, last: int, flags: tuple[str, ...]) -> None:
     """A robot in the dark, whose IMU sends its last samples with one of the frames."""
     bundles = list(robot_world.bundles(110))
     black, none = np.zeros_like(bundles[0].frame.left), ImuSamples.empty()

@@ -38,6 +38,12 @@ def test_the_evidence_of_each_verdict(expected: str) -> None:
     assert found.places_m == ([(20.0, 6.0), (20.0, 11.0)] if expected == "lookalike" else [])
 
 
+def test_a_silent_imu_tells_nothing_of_a_changed_building() -> None:
+    silent, dark = (msgspec.structs.replace(of, flags=("imu_silent",)) for of in (EMPTY, FailureEvidence(0, 33)))
+    assert verdict(msgspec.structs.replace(REPORT, evidence=silent)).says == "building"
+    assert verdict(msgspec.structs.replace(REPORT, cause=Cause.DARK, evidence=dark)).words.endswith("%): imu silent")
+
+
 def test_failures_elsewhere_revise_it() -> None:
     assert verdict(REPORT, own_elsewhere=3).robot > 0.5 > verdict(REPORT).robot > verdict(REPORT, others_here=1).robot
 
