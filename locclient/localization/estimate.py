@@ -108,7 +108,7 @@ def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> E
     if tracker.confirmed is not None:
         return _of_confirmed(estimate, tracker, tracker.confirmed, has_failed)
     candidates, prior, settings = tracker.candidates, tracker.prior, tracker.settings
-    ranking, competitors = tracker.offered()
+    ranking, competitors = candidates.ranking()
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
     status = Status.AMBIGUOUS if is_open else Status.LOST if tracker.was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))

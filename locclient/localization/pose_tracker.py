@@ -398,16 +398,6 @@ class PoseTracker:
             self.confirmed = None
             self.prior = None  # it led to that pose
 
-    def offered(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
-        """Return the candidates, of which the first is offered, and its competitors. Where the whole site is mapped, these are all others
-        until enough fixes support it: what one look prefers the next may take back, and an offer counts as a fix. Not where an operator or
-        a dock names its place, nor for a robot that knows its place by its own way: no look alone decides there."""
-        (order, competitors), prior = self.candidates.ranking(), self.prior
-        if not order or not self.settings.is_whole_site_mapped or self.candidates.is_supported(best := order[0]):
-            return order, competitors
-        is_told = best.told_log_odds > 0.0 or (prior is not None and (not prior.is_told or prior.confirms(best)))
-        return order, competitors if is_told else order[1:]
-
     def update_candidates(self, fixes: list[Fix], *, outside: bool, is_one_map: bool = True) -> TimeSliced[QueryResult]:
         """Update the candidates, and confirm one without competitors and with enough support or a tight prior.
 
@@ -426,7 +416,7 @@ class PoseTracker:
         yield from candidates.update(observations, self.odom_from_body)
         if not fixes:
             return OUTSIDE_PRIOR if outside else NO_AGREEMENT
-        (best, *_), competitors = self.offered()
+        (best, *_), competitors = candidates.ranking()
         if competitors:
             told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))
             return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")

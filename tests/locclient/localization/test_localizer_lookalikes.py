@@ -236,19 +236,6 @@ def test_who_is_believed_at_once(sure_robot: Robot, is_revisable: bool, places: 
     assert sure_robot.ride(3, 0.4, places)[0].status is Status.TRACKING
 
 
-@pytest.mark.parametrize("sigma_m", [0.3, 0.5])
-def test_a_dock_is_believed_beside_a_worse_place_within_its_bound(sure_robot: Robot, sigma_m: float) -> None:
-    """And a robot whose own way became vague keeps its pose where it sees such a place beside its own."""
-    exact = sure_robot._fix
-    about = {False: {"inliers": 150, "landmark_recall": 0.8}, True: {"inliers": 75, "landmark_recall": 0.1}}
-    sure_robot._fix = lambda off_m: replace(exact(off_m), **about[bool(off_m.any())])  # type: ignore[method-assign]
-    sure_robot.told(sigma_m, is_whole=True)
-    assert {e.status for e in sure_robot.ride(5, 0.0, [off(0.0), off(1.0)])} == {Status.TRACKING}
-    sure_robot.odometry.drift_share = 0.3
-    sure_robot.ride(15, 0.3, NO_FIX)
-    assert {e.status for e in sure_robot.ride(5, 0.0, [off(0.0), TWIN])} == {Status.DEGRADED}
-
-
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_a_robot_that_can_tell_places_apart_looks_more_often(monkeypatch: pytest.MonkeyPatch, is_whole: bool) -> None:
     """Seen: one of ten robots that woke among identical aisles knew its aisle only after 20 s of driving.

@@ -20,7 +20,6 @@ from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 
-RIG = [MountedCamera(StereoCamera(500.0, 320.0, 240.0, 0.1, 640, 480), np.eye(4))]
 STEP = se3(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([0.07, 0.0, 0.0]))
 
 
@@ -38,7 +37,7 @@ def started(cameras: list[MountedCamera]) -> PoseTracker:
 
 def test_the_frame_of_a_long_search_moves_once_with_each_frame() -> None:
     """Kept to be pooled with later ones while its own search goes on; the odometry drops it meanwhile."""
-    tracker = started(RIG)
+    tracker = started([MountedCamera(StereoCamera(500.0, 320.0, 240.0, 0.1, 640, 480), np.eye(4))])
     tracker.begin_query(odometry(0))
     tracker.keep_frame(cast("FrameFeatures", None))
     motion = Motion(STEP, 1e-8 * np.eye(6), is_last=True)
@@ -116,21 +115,6 @@ def test_another_place_competes_in_the_mean_or_in_the_present_query(
 def test_a_place_that_is_seen_competes_with_the_best_that_is_not() -> None:
     best, other = hypothesis([161, 217, 0], [0.29, 0.35, 0.0]), hypothesis([0, 0, 60], [0.0, 0.0, 0.1])
     assert competitors([other, best]) == [other]
-
-
-@pytest.mark.parametrize(("travelled_m", "is_open"), [(0.0, True), (1.2, False)])
-def test_a_site_that_is_mapped_as_a_whole_offers_no_place_of_several_before_fixes_support_it(
-    travelled_m: float, is_open: bool
-) -> None:
-    """Seen: a standing robot's first look preferred one aisle of six by 187 matches to 97, and the next one took it back."""
-    best, weak = hypothesis([187], [0.31]), hypothesis([97], [0.19])
-    best.support, best.travelled_m = 3, travelled_m
-    tracker = PoseTracker(LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True)), RIG, np.eye(4), HeldMaps())
-    tracker.candidates.hypotheses = [weak, best]
-    assert tracker.candidates.ranking() == ([best, weak], [])
-    assert tracker.offered() == ([best, weak], [weak] if is_open else [])
-    tracker.candidates.hypotheses = [best]
-    assert tracker.offered() == ([best], [])
 
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
