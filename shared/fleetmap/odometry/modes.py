@@ -443,6 +443,8 @@ class StartingMode(GyroMode):
             len(recent) < 5
             or stamps[-1] - stamps[0] < settings.moving_duration_s * 0.9e9
             or np.diff(stamps).max() > settings.moving_gap_s * 1e9
+            # An IMU that began or paused between these frames did not feel all of their motion: the rest would count as bias.
+            or longest_gap_ns(self._imu.samples.imu.stamps_ns, stamps[0], stamps[-1]) > IMU_GAP_NS
         ):
             return None
         vision = Trajectory(stamps, np.array([odom_from_body for _, odom_from_body in recent]))

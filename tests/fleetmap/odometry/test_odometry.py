@@ -112,6 +112,17 @@ def test_redefining_odom_carries_the_past_along(inertial: tuple[Odometry, list[O
     assert np.linalg.norm(relative_error(carried, now)[3:]) < 0.02
 
 
+def test_an_imu_that_begins_while_the_robot_drives_starts_by_what_it_felt_itself() -> None:
+    """Motion before its first sample would count as a bias of the gyro, and the filter would leave the images."""
+    felt = noisy_imu(np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.zeros(3))
+    frames = (stereo_frame(k * FRAME_NS) for k in range(1, 81))
+    late = felt.between(40 * FRAME_NS, 80 * FRAME_NS + 1)
+    said = driven(Odometry(mounted(IMU), OdometrySettings()), frames, late)
+    started = next(n for n, e in enumerate(said) if e.inertial)
+    np.testing.assert_allclose(said[started].gyro_bias_radps, [0.01, -0.02, 0.015], atol=0.004)
+    assert not any(e.status is OdometryStatus.DEGRADED for e in said[started:])
+
+
 def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
     odometry, estimates = visual
     assert all(e.status is OdometryStatus.TRACKING and not e.inertial for e in estimates)
