@@ -1,8 +1,8 @@
 """Measures the figures of acceptance.toml and compares them with their limits: `make acceptance`, before and after a large change.
 
 `PYTHONPATH=tests python tests/acceptance.py [NAME...] [--all] [--out FILE.json]`: without names the entries that are not marked `long`.
-Each entry is a module with its options, which writes JSON to the path in place of `{out}`, and limits of figures in it: keys joined by
-`/`, `*` for every entry of a list or table. Times are CPU times at the yardstick's reference. Entries whose recordings are missing are
+Each entry is a module with its options, which writes JSON to the path in place of `{out}`, and limits of figures in it: keys or numbers
+joined by `/`, with `*` as in names of files. Times are CPU times at the yardstick's reference. Entries whose recordings are missing are
 reported as not measured. Exit status 1 on any miss; a command that fails is one. Figures under `shown` have no limit.
 """
 
@@ -12,6 +12,7 @@ import operator
 import sys
 import tomllib
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +22,20 @@ COMPARISONS = {"at_most": operator.le, "at_least": operator.ge, "equals": operat
 
 
 def figures_at(values: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Every figure that a path of keys names, with its full path; KeyError if the path names none."""
+    """Every figure that a path of keys names, with its full path."""
     first, _, rest = path.partition("/")
-    keys = range(len(values)) if isinstance(values, list) else list(values)
-    for key in keys if first == "*" else [int(first) if isinstance(values, list) else first]:
-        if not rest:
-            yield str(key), values[key]
+    for key, value in values.items() if isinstance(values, dict) else enumerate(values):
+        if not fnmatchcase(str(key), first):
             continue
-        for name, value in figures_at(values[key], rest):
-            yield f"{key}/{name}", value
+        for name, figure in figures_at(value, rest) if rest else [("", value)]:
+            yield f"{key}/{name}".rstrip("/"), figure
 
 
 def compared(entry: dict[str, Any], values: Any) -> Iterator[tuple[str, Any, str, bool]]:
-    """Figure, value, limit and whether it holds."""
+    """Figure, value, limit and whether it holds, which no limit does whose path names no figure."""
     for how, holds in COMPARISONS.items():
         for path, limit in entry.get(how, {}).items():
-            for name, value in figures_at(values, path):
+            for name, value in list(figures_at(values, path)) or [(path, None)]:
                 yield name, value, f"{how} {limit}", value is not None and holds(value, limit)
 
 

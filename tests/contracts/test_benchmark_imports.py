@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from acceptance import compared
 from conftest import TESTS
 
 PROGRAMS = sorted(path for folder in ("benchmarks", "studies", "golden") for path in (TESTS / folder).rglob("*.py"))
@@ -41,3 +42,14 @@ def test_every_entry_names_a_program(file: str) -> None:
     modules = {shlex.split(entry["command"])[0] for entry in entries}
     assert {name for name in modules if TESTS / f"{name.replace('.', '/')}.py" not in PROGRAMS} == set()
     assert all("--out {out}" in entry["command"] for entry in entries)
+
+
+def test_a_limit_whose_path_names_no_figure_does_not_hold() -> None:
+    """Seen: such a path ended a record of an hour with an exception in its last second."""
+    entry = {"at_most": {"*/b_*": 1, "a/c": 1}}
+    values = {"a": {"b_1": 0, "b_2": 2}, "d": [{"b_": 1}]}
+    assert list(compared(entry, values)) == [
+        ("a/b_1", 0, "at_most 1", True),
+        ("a/b_2", 2, "at_most 1", False),
+        ("a/c", None, "at_most 1", False),
+    ]
