@@ -134,10 +134,10 @@ def case(name: str) -> Row:
 CASES: dict[str, Callable[[], Row]] = {name: partial(case, name) for name in PEERS}
 COLUMNS = [
     Column("recording", "recording"), Column("survey_mm", "survey, aligned", "{:.1f}"),
-    Column("survey_of_known_rig_mm", "rig surveyed before", "{:.1f}"), Column("peers", "others, same frames"),
+    Column("survey_of_known_rig_mm", "survey, rig known", "{:.1f}"), Column("peers", "others, same frames"),
     Column("odometry_mm", "as it drives, not aligned", "{:.0f}"),
     Column("odometry_share", "its end, of the path", "{:.2%}"), Column("robot_median_mm", "robot in the map, not aligned", "{:.1f}"),
-    Column("robot_of_known_rig_median_mm", "rig surveyed before", "{:.1f}"),
+    Column("robot_of_known_rig_median_mm", "robot, rig known", "{:.1f}"),
     Column("localised_share", "localised", "{:.0%}"), Column("silent", "silent failures"), Column("published", "published, whole sequence"),
 ]  # fmt: skip
 
