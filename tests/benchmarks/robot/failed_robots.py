@@ -226,7 +226,8 @@ def _driven(run: EstimatorSession, case: Case, rng: Random, view: MapView, tile:
     nominal, mounted = run.session.nominal, (MountedCamera(run.camera, run.body_from_cam),)
     rig = MountedRig(nominal, mounted, nominal.cameras[0].imu_minus_cam_s)
     mounting = {"rig": rig, "calibration": nominal, "mounted": mounted, "body_from_cam": run.body_from_cam}
-    robot = Robot(SimpleNamespace(**mounting, rectify=lambda frame: frame), SETTINGS, TrialSettings())
+    mounting |= {"imu_minus_cam_s": rig.imu_minus_cam_s, "rectify": lambda frame: frame}
+    robot = Robot(SimpleNamespace(**mounting), SETTINGS, TrialSettings())
     odometry, settings = robot.localizer.perception.odometry, SETTINGS.odometry.tracker
     odometry._new_tracker = lambda first, _: estimator_loop.EstimatorTracker(run, run.camera, settings, first)
     odometry._tracker = odometry._new_tracker(0, 0)
