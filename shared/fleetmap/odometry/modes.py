@@ -17,7 +17,9 @@ from fleetmap.odometry.filter.msckf import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.init.imu_alignment import (
+    LOOK_BACK_NS,
     dynamic_initialization,
+    felt_part,
     is_steady,
     polynomial_rate,
     static_initialization,
@@ -396,6 +398,7 @@ class StartingMode(GyroMode):
         stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.odom_from_body()
         if step.is_lost:
             self._trajectory.clear()
+        self._trajectory = [seen for seen in self._trajectory if stamp_ns - seen[0] <= LOOK_BACK_NS]
         self._trajectory.append((stamp_ns, old_odom_from_body))
         start = self._static_start(stamp_ns) or self._dynamic_start()
         if start is None:
@@ -437,18 +440,14 @@ class StartingMode(GyroMode):
 
     def _dynamic_start(self) -> InitialState | None:
         settings = self._rig.settings.start
-        recent = self._trajectory[-settings.moving_frames :]
-        stamps = np.array([stamp for stamp, _ in recent], np.int64)
-        if (
-            len(recent) < 5
-            or stamps[-1] - stamps[0] < settings.moving_duration_s * 0.9e9
-            or np.diff(stamps).max() > settings.moving_gap_s * 1e9
-            # An IMU that began or paused between these frames did not feel all of their motion: the rest would count as bias.
-            or longest_gap_ns(self._imu.samples.imu.stamps_ns, stamps[0], stamps[-1]) > IMU_GAP_NS
-        ):
+        stamps, places = zip(*self._trajectory[-2 * settings.moving_frames :], strict=True)
+        seen, imu = Trajectory(np.array(stamps, np.int64), np.array(places)), self._imu.samples.imu
+        vision, felt_ns = felt_part(seen, imu, settings.moving_frames - 1)
+        if len(felt_ns) < 4 or felt_ns.sum() < settings.moving_duration_s * 0.9e9:
             return None
-        vision = Trajectory(stamps, np.array([odom_from_body for _, odom_from_body in recent]))
-        return dynamic_initialization(vision, self._imu.samples.imu, self._imu.weighing_noise, self._rig.settings)
+        if felt_ns.max() > settings.moving_gap_s * 1e9:
+            return None
+        return dynamic_initialization(vision, imu, self._imu.weighing_noise, self._rig.settings)
 
 
 class InertialMode(WindowMode):

@@ -21,7 +21,7 @@ from fleetmap.odometry.settings import FilterSettings, OdometrySettings, Tracker
 from fleetmap.odometry.tracking.tracker import Earlier, Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import WheelSample
+from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization.place import ORIGIN
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -112,14 +112,20 @@ def test_redefining_odom_carries_the_past_along(inertial: tuple[Odometry, list[O
     assert np.linalg.norm(relative_error(carried, now)[3:]) < 0.02
 
 
-def test_an_imu_that_begins_while_the_robot_drives_starts_by_what_it_felt_itself() -> None:
-    """Motion before its first sample would count as a bias of the gyro, and the filter would leave the images."""
+@pytest.mark.parametrize(
+    ("from_ms", "lost_ms", "every_ms", "by"), [(2000, 0, 1, 60), (0, 60, 1000, 23), (0, 60, 400, 30)]
+)
+def test_a_start_in_motion_is_by_what_the_imu_felt(from_ms: int, lost_ms: int, every_ms: int, by: int) -> None:
+    """Motion before its first sample, or lost, would count as a bias of the gyro, and the filter would leave the images."""
     felt = noisy_imu(np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.zeros(3))
     frames = (stereo_frame(k * FRAME_NS) for k in range(1, 81))
-    late = felt.between(40 * FRAME_NS, 80 * FRAME_NS + 1)
-    said = driven(Odometry(mounted(IMU), OdometrySettings()), frames, late)
+    stamps_ms = felt.stamps_ns // 10**6
+    kept = (stamps_ms >= from_ms) & ((stamps_ms + 500) % every_ms >= lost_ms)
+    part = ImuSamples(felt.stamps_ns[kept], felt.gyro_radps[kept], felt.accel_mps2[kept])
+    said = driven(Odometry(mounted(IMU), OdometrySettings()), frames, part)
     started = next(n for n, e in enumerate(said) if e.inertial)
-    np.testing.assert_allclose(said[started].gyro_bias_radps, [0.01, -0.02, 0.015], atol=0.004)
+    assert from_ms // 50 + 17 <= started <= by
+    np.testing.assert_allclose(said[started].gyro_bias_radps, [0.01, -0.02, 0.015], atol=0.005)
     assert not any(e.status is OdometryStatus.DEGRADED for e in said[started:])
 
 

@@ -14,11 +14,14 @@ from fleetmap import core
 from fleetmap.geometry import Array, rotation_between_vectors, se3, skew, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MPS2, Preintegrated, preintegrate
 from fleetmap.odometry.filter.msckf import InitialState, NavState
+from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings, StartSettings
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.samples import ImuSamples, Trajectory
+from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
 _MAX_BIAS_SIGMAS = 6.0  # a larger accelerometer bias indicates a wrong fit
+_Step = tuple[int, int, int]  # the number of a frame, its stamp and the next one's
+_Term = tuple[int, Preintegrated]  # the number of a frame, and the motion until the next one
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +67,16 @@ def align(
 ) -> Alignment | None:
     """Align with the given number of Gauss-Newton steps; None if the fitted gravity is implausible or a bias of either sensor too large.
 
+    Motion that the IMU missed would count as a bias: only steps between frames that it felt whole are compared.
     gravity_slack: factor on the settings' tolerance of gravity's size in the linear step.
     """
-    gyro_bias = np.zeros(3)
+    gyro_bias, felt = np.zeros(3), _felt_steps(motion.stamps_ns, imu)
     for _ in range(2):
-        gyro_bias = gyro_bias + _gyro_bias_step(motion, imu, noise, gyro_bias)
+        gyro_bias = gyro_bias + _gyro_bias_step(motion, felt, imu, noise, gyro_bias)
     # A bias larger than that of any gyro at rest comes from wrong tracks.
     if not np.linalg.norm(gyro_bias) < settings.start.steady_gyro_mean_radps:
         return None
-    terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
+    terms = [(k, preintegrate(imu, start, end, gyro_bias, np.zeros(3), noise)) for k, start, end in felt]
     gravity = _free_gravity(motion, terms)
     max_error = gravity_slack * settings.start.max_gravity_error_mps2
     if gravity is None or abs(np.linalg.norm(gravity) - GRAVITY_MPS2) > max_error:
@@ -119,9 +123,24 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     return InitialState(state, covariance + least, int(vision.stamps_ns[-1]))
 
 
-def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:
+def felt_part(vision: Trajectory, imu: ImuSamples, most: int) -> tuple[Trajectory, Stamps]:
+    """The frames beside the last `most` steps that the IMU felt whole, and durations (S,) of these in ns; empty if the newest is none."""
+    felt = np.array([k for k, *_ in _felt_steps(vision.stamps_ns.tolist(), imu)[-most:]], np.int64)
+    felt = felt[: len(felt) if len(vision) - 2 in felt else 0]
+    beside = np.union1d(felt, felt + 1)
+    return Trajectory(vision.stamps_ns[beside], vision.frame_from_body[beside]), np.diff(vision.stamps_ns)[felt]
+
+
+def _felt_steps(stamps_ns: Sequence[int], imu: ImuSamples) -> list[_Step]:
+    steps = [(k, start, end) for k, (start, end) in enumerate(pairwise(stamps_ns))]
+    return [step for step in steps if core.longest_gap_ns(imu.stamps_ns, step[1], step[2]) <= IMU_GAP_NS]
+
+
+def _gyro_bias_step(
+    motion: VisualMotion, felt: list[_Step], imu: ImuSamples, noise: ImuNoise, gyro_bias: Array
+) -> Array:
     hessian, gradient = np.zeros((3, 3)), np.zeros(3)
-    for k, (start_ns, end_ns) in enumerate(pairwise(motion.stamps_ns)):
+    for k, start_ns, end_ns in felt:
         term = preintegrate(imu, start_ns, end_ns, gyro_bias, np.zeros(3), noise)
         error = so3_log(term.delta_rotation.T @ (motion.rotations[k].T @ motion.rotations[k + 1]))
         hessian += term.d_rotation_d_gyro.T @ term.d_rotation_d_gyro
@@ -129,9 +148,9 @@ def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro
     return np.asarray(np.linalg.solve(hessian + 1e-12 * np.eye(3), gradient))
 
 
-def _free_gravity(motion: VisualMotion, terms: list[Preintegrated]) -> Array | None:
+def _free_gravity(motion: VisualMotion, terms: list[_Term]) -> Array | None:
     """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale if unknown."""
-    parts = [_equations(motion, k, term, 1.0, np.eye(3), np.zeros(3), None) for k, term in enumerate(terms)]
+    parts = [_equations(motion, k, term, 1.0, np.eye(3), np.zeros(3), None) for k, term in terms]
     rows, right = (np.concatenate(sides) for sides in zip(*parts, strict=True))
     weights = np.tile(np.repeat(motion.gravity_weights, 3), len(terms))
     solution, _, rank, _ = np.linalg.lstsq(rows * weights[:, None], right * weights, rcond=None)
@@ -168,7 +187,7 @@ def _equations(
 
 
 def _sphere_step(
-    motion: VisualMotion, terms: list[Preintegrated], gravity: Array, basis: Array, accel_bias: Array, bias_sigma: float
+    motion: VisualMotion, terms: list[_Term], gravity: Array, basis: Array, accel_bias: Array, bias_sigma: float
 ) -> tuple[Array, Array]:
     """One Gauss-Newton step with gravity's size known: solution and covariance, see `Alignment`.
 
@@ -178,7 +197,7 @@ def _sphere_step(
     size = (5 if motion.unscaled is None else 6) + 3 * count
     hessian, gradient, squares = np.zeros((size, size)), np.zeros(size), 0.0
     weights = np.repeat([motion.sigma_m**-2, motion.sigma_mps**-2], 3)
-    for k, term in enumerate(terms):
+    for k, term in terms:
         rows, right = _equations(motion, k, term, GRAVITY_MPS2, basis, gravity, accel_bias)
         hessian += rows.T @ (weights[:, None] * rows)
         gradient += rows.T @ (weights * right)
@@ -188,7 +207,7 @@ def _sphere_step(
     covariance = np.linalg.inv(hessian + 1e-9 * np.eye(size))
     solution = np.asarray(covariance @ gradient)
     if motion.unscaled is not None:
-        left = max(squares - float(gradient @ solution), 0.0) / max(6 * (count - 1) - size + 3, 1)
+        left = max(squares - float(gradient @ solution), 0.0) / max(6 * len(terms) - size + 3, 1)
         covariance = max(left, 1.0) * covariance
     return solution, np.asarray(covariance)
 
@@ -241,16 +260,20 @@ def mono_inertial_initialization(
     return initial_state(Trajectory(vision.stamps_ns, vision_from_body), found), scale
 
 
-_MAX_LOOK_BACK_S = 20.0
+LOOK_BACK_NS = 20_000_000_000  # of a start by rest
+_STEADY_PARTS = 10  # of a steady window, whose means must agree: a gap of this length leaves one without samples
 _JUDGED_NS = 500_000_000
 
 
 def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
-    """State at the end of the latest steady window before `until_ns`; None if the IMU was never steady."""
+    """State at the end of the latest steady window before `until_ns`; None if the IMU was not steady since it last lost samples."""
     window_ns = int(settings.start.steady_window_s * 1e9)
-    if not len(imu):
+    # What was lost may be motion: a window over a gap, or before one, tells neither the biases nor how the body stands now.
+    gaps = np.flatnonzero(np.diff(imu.stamps_ns, append=until_ns) > window_ns // _STEADY_PARTS)
+    since = imu.stamps_ns[gaps[-1] + 1 if len(gaps) else 0 :]
+    if not len(since):
         return None
-    first_ns = max(int(imu.stamps_ns[0]), until_ns - int(_MAX_LOOK_BACK_S * 1e9))
+    first_ns = max(int(since[0]), until_ns - LOOK_BACK_NS)
     end_ns = core.latest_steady(
         imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, first_ns, until_ns, window_ns, _limits(settings.start)
     )

@@ -14,7 +14,7 @@ from fleetmap.inertial import preintegrate
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.msckf import InitialState, InvariantFilter, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization, static_initialization
+from fleetmap.odometry.init.imu_alignment import felt_part, mono_inertial_initialization, static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.mono.wheel_mode import WheelMode
@@ -23,7 +23,7 @@ from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
-from fleetmap.sensors.samples import Stamps, Trajectory
+from fleetmap.sensors.samples import Trajectory
 
 _STILL_S = 0.5
 _STILL_SIGMA_MPS = 0.02
@@ -226,14 +226,15 @@ class MonocularMode(Mode):
         if stamp_ns - self._tried_ns < settings.monocular.sample_interval_s * 1e9:
             return None
         self._tried_ns = stamp_ns
-        vision = self._spaced_trajectory(imu.samples.imu.stamps_ns)
+        most = settings.monocular.metric_max_samples - 1
+        vision, _ = felt_part(self._spaced_trajectory(), imu.samples.imu, most)
         if len(vision) < settings.monocular.metric_samples:
             return None
         noise, body_from_cam = imu.weighing_noise, self._rig.body_from_cam
         return mono_inertial_initialization(vision, imu.samples.imu, noise, body_from_cam, settings)
 
-    def _spaced_trajectory(self, imu_stamps_ns: Stamps) -> Trajectory:
-        """vision_from_cam of located frames since a gap in the samples, far enough apart, including the newest, in order of time."""
+    def _spaced_trajectory(self) -> Trajectory:
+        """vision_from_cam of located frames far enough apart in time, including the newest, in order of time."""
         settings = self._rig.settings
         stamps: list[int] = []
         vision_from_cams: list[Array] = []
@@ -243,8 +244,7 @@ class MonocularMode(Mode):
             gap_ns = stamps[-1] - stamp_ns if stamps else 0
             if stamps and gap_ns < settings.monocular.sample_interval_s * 1e9:
                 continue
-            is_missing = stamps and core.longest_gap_ns(imu_stamps_ns, stamp_ns, stamps[-1]) > IMU_GAP_NS
-            if is_missing or gap_ns > settings.start.moving_gap_s * 2e9:
+            if gap_ns > settings.start.moving_gap_s * 2e9:
                 break
             stamps.append(stamp_ns)
             vision_from_cams.append(there)

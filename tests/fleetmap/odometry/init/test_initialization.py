@@ -75,6 +75,28 @@ def test_the_latest_steady_window_counts() -> None:
     assert 1.7e9 < start.stamp_ns < 2.1e9
 
 
+@pytest.mark.parametrize("turn_radps", [0.0, 0.12])
+def test_what_is_left_beside_a_gap_is_no_rest(turn_radps: float) -> None:
+    """Of a turn, a few even samples after a gap would be a bias. A rest before it, and one that nothing follows, is not the present."""
+    rest = at_rest(np.random.default_rng(5), np.eye(3), np.zeros(3))
+    stamps_ns, turned = (
+        rest.stamps_ns,
+        rest.gyro_radps + (rest.stamps_ns >= 1_700_000_000)[:, None] * [0, 0, turn_radps],
+    )
+    kept = (stamps_ns < 1_000_000_000) | ((stamps_ns >= 1_700_000_000) & (stamps_ns < 1_850_000_000))
+    imu = ImuSamples(stamps_ns[kept], turned[kept], rest.accel_mps2[kept])
+    assert static_initialization(imu, 1_850_000_000, SETTINGS) is None
+    assert static_initialization(rest.between(0, 1_000_000_000), 1_500_000_000, SETTINGS) is None
+
+
+def test_a_resting_imu_that_loses_samples_each_second_starts() -> None:
+    rest = at_rest(np.random.default_rng(6), np.eye(3), np.zeros(3))
+    kept = (rest.stamps_ns // 10**6 + 300) % 1000 >= 60
+    imu = ImuSamples(rest.stamps_ns[kept], rest.gyro_radps[kept], rest.accel_mps2[kept])
+    start = static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS)
+    np.testing.assert_allclose(start.state.gyro_bias_radps, GYRO_BIAS, atol=1.5e-3)
+
+
 def test_motion_is_not_rest() -> None:
     imu = noisy_imu(np.random.default_rng(4), 2.0, NOISE, np.zeros(3), np.zeros(3))
     assert static_initialization(imu, int(imu.stamps_ns[-1]), SETTINGS) is None

@@ -87,6 +87,25 @@ def test_an_imu_makes_it_metric() -> None:
     assert down @ true > np.cos(np.radians(1.0))
 
 
+@pytest.mark.parametrize(("from_ms", "lost_ms"), [(1500, 0), (0, 60)])
+def test_an_imu_that_was_late_or_loses_samples_makes_it_metric(from_ms: int, lost_ms: int) -> None:
+    """By the motion that the IMU felt: what it missed hides the scale."""
+    felt = noisy_imu(np.random.default_rng(1), 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
+    stamps_ms = felt.stamps_ns // 10**6
+    kept = (stamps_ms >= from_ms) & ((stamps_ms + 500) % 1000 >= lost_ms)
+    part = ImuSamples(felt.stamps_ns[kept], felt.gyro_radps[kept], felt.accel_mps2[kept])
+    frames = (replace(stereo_frame(k * FRAME_NS), right=None) for k in range(1, FRAMES + 1))
+    said = driven(make_odometry(single(IMU), OdometrySettings()), frames, part)
+    metric = next(e for e in said if e.scale_known)
+    assert metric.gyro_bias_radps == pytest.approx(GYRO_BIAS, abs=0.004)
+    assert all(e.scale_known and e.status is OdometryStatus.TRACKING for e in said[metric.frame_index :])
+    last, truths = said[-1], [analytic_motion(e.stamp_ns * 1e-9).map_from_body for e in (metric, said[-1])]
+    way_m, true_m = (
+        np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in [(metric.odom_from_body, last.odom_from_body), truths]
+    )
+    assert way_m == pytest.approx(true_m, rel=0.04)
+
+
 def vision(times_s: Array, unit_m: float, rng: np.random.Generator) -> Trajectory:
     """vision_from_cam along the analytic motion, in units of its own and some axes of its own, with a little noise."""
     odd = analytic_motion(1.234).map_from_body
