@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.geometry import se3, skew, so3_exp
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.quality.map_error import _linearised, _marginals, error_words, map_errors
+from mapserver.quality.map_error import _linearised, _marginals, _scales, error_words, map_errors
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import observed, plain_survey
 
@@ -57,6 +57,15 @@ def test_what_passes_disagree_beyond_their_noise_is_an_error_and_without_passes_
     for less in (observed(survey, survey.obs_keyframe < LAP // 2), replace(survey, scale_known=False)):
         assert map_errors(less, TILES, 16.0) == {}
     assert error_words({}).startswith("own error unknown")
+
+
+def test_looks_that_hardly_tell_do_not_widen_the_map_by_some_bad_ones_and_a_bent_stretch_does() -> None:
+    of_looks = np.repeat([0.0004, 0.02], 40)[:, None] ** 2
+    squared = 0.6 * of_looks
+    squared[-3:] = 0.1**2
+    assert np.mean(squared / of_looks) > 1.2 and _scales(squared, of_looks) == (1.0, 0.0)
+    squared[:8] = 0.01**2
+    assert _scales(squared, of_looks)[1] > 0.003**2
 
 
 def test_tiles_without_marginals_of_their_own_have_those_of_the_nearest_place(monkeypatch: pytest.MonkeyPatch) -> None:
