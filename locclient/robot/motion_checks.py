@@ -103,6 +103,7 @@ class SpeedGauge:
 
 
 _ASK = "record a drive and ask `mapserver doctor`"
+_SILENT_NS = 1_000_000_000  # longer than samples of a sound IMU are on their way
 
 
 def imu_refused(late_s: float | None) -> dict[Flag, str]:
@@ -113,6 +114,12 @@ def imu_refused(late_s: float | None) -> dict[Flag, str]:
         when = f"its stamps are about {abs(late_s):.2f} s {side} by the turns of the images"
         words = f"{when}; stamp both by one clock, or {_ASK} for the timeshift_cam_imu to set"
     return {Flag.IMU_REFUSED: f"the IMU is left out: {words}"}
+
+
+def imu_silent(for_ns: int) -> dict[Flag, str]:
+    """Return the flag of a calibrated IMU without samples for so long before the images, with its text; empty for less than a second."""
+    words = "no samples since more than a second before the images; is it connected, and are both stamped by one clock?"
+    return {Flag.IMU_SILENT: f"the IMU is silent: {words}"} if for_ns > _SILENT_NS else {}
 
 
 def accelerometer_refused(fault: str) -> dict[Flag, str]:

@@ -8,7 +8,7 @@ from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
-from fleetmap.messages import IMU_SILENT, Cause, FailureKind, Flag, PoseMessage, Status
+from fleetmap.messages import Cause, FailureKind, Flag, PoseMessage, Status
 from fleetmap.odometry.mono.mono_modes import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -26,7 +26,6 @@ from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.version_trial import TrialSettings, VersionTrials
 
 Clock = Callable[[], float]  # seconds
-_SILENT_NS = 1_000_000_000  # longer than samples of a sound IMU are on their way
 _MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
 
 
@@ -34,8 +33,8 @@ class FailureContext(NamedTuple):
     """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
     unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
-    cut: recording of the seconds around its onset, None without one. flags: `left_out` of `Outcome`, and an IMU that is silent;
-    dropped_share: as of `Outcome`.
+    cut: recording of the seconds around its onset, None without one. flags: of sensors left out or silent, and of an
+    overload; dropped_share: as of `Outcome`.
     """
 
     failure: Failure
@@ -54,8 +53,8 @@ class Outcome:
 
     cpu_s: from received images to estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
     an arrival. speed_mps: by the wheels, else by the odometry, None if unknown. may_be_mapped: False if the robot is not localized and
-    the map has no tile nearby. left_out: flags of disabled sensors, which contradict all others, and of an overload, with texts.
-    dropped_share: of the frames of the last seconds, dropped before they were handled.
+    the map has no tile nearby. left_out: flags of disabled sensors, which contradict all others, of a silent IMU, and of an overload, with
+    texts. dropped_share: of the frames of the last seconds, dropped before they were handled.
     """
 
     estimate: Estimate
@@ -117,7 +116,10 @@ class Robot:
         self._wheels = motion_checks.WheelAgreement(calibration.base_from_body)
         self._views = motion_checks.ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
-        self._imu_ns = 0  # of the last sample, by the clock of images
+        self._imu_ns = self._silent_ns = (
+            0  # stamp of the last IMU sample by the clock of images, and the last frame's time since
+        )
+        self._set_back: Mapping[Flag, str] = {}  # sensors whose clock was
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
@@ -163,6 +165,8 @@ class Robot:
         rectified_s = self._clock_s()
         if self.localizer.perception.awaits(frame):
             return None
+        self._imu_ns = self._imu_ns or frame.stamp_ns
+        self._silent_ns = frame.stamp_ns - self._imu_ns
         for prior in [prior for source in self._image_priors for prior in source.priors(frame)]:
             self.localizer.handle_prior(prior)
             if self.ring is not None:
@@ -207,11 +211,12 @@ class Robot:
         dock_error_m = self._docks.handle(bundle.priors, estimate, odom_from_body)
         return Outcome(
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered,
-            {**self._left_out(), **refused, **bundle.left_out}, self._load.dropped_share,
+            {**self._left_out(), **refused}, self._load.dropped_share,
         )  # fmt: skip
 
     def _take_samples(self, bundle: SensorBundle) -> Sequence[WheelSample]:
         """Pass on what arrived beside the frame, and return the samples of wheels that may be used."""
+        self._set_back = bundle.left_out
         self.localizer.handle_imu(bundle.imu)
         if len(bundle.imu):
             self._imu_ns = int(bundle.imu.stamps_ns[-1]) - int(self._rectifier.imu_minus_cam_s * 1e9)
@@ -230,11 +235,13 @@ class Robot:
     def _left_out(self) -> dict[Flag, str]:
         odometry = self.localizer.perception.odometry
         if self._images_refused:
-            return {**self._images_refused, **self._wheels_unused, **self._load.overload}
+            return {**self._images_refused, **self._wheels_unused, **self._load.overload, **self._set_back}
         wheels = self._wheels.refused or self._wheels_unused
         imu = motion_checks.imu_refused(odometry.clock.off_s) if odometry.refuses_imu else {}
+        if self._rectifier.calibration.imu and not imu and Flag.IMU_REFUSED not in self._set_back:
+            imu = motion_checks.imu_silent(self._silent_ns)
         accelerometer = motion_checks.accelerometer_refused(odometry.accelerometer.fault)
-        return {**imu, **accelerometer, **wheels, **self._load.overload}
+        return {**imu, **accelerometer, **wheels, **self._load.overload, **self._set_back}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """Return the failure of a source without frames for so many seconds."""
@@ -267,8 +274,7 @@ class Robot:
         failure = failure._replace(stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.open.get(FailureKind.NOT_FOUND, onset)
         cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
-        is_silent = bool(self._rectifier.calibration.imu) and failure.estimate.stamp_ns - self._imu_ns > _SILENT_NS
-        flags = (*([IMU_SILENT] if is_silent else []), *self._left_out())
+        flags = tuple(self._left_out())
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut, flags, self._load.dropped_share)
 
     def _show(self, loaded: LoadedMap) -> None:

@@ -89,6 +89,7 @@ class Flag(StrEnum):
     NOT_LOCALISED = "not_localised"
     OFF_MAP = "off_map"
     IMU_REFUSED = "imu_refused"
+    IMU_SILENT = "imu_silent"
     ACCELEROMETER_REFUSED = "accelerometer_refused"
     WHEELS_REFUSED = "wheels_refused"
     WHEELS_UNMOUNTED = "wheels_unmounted"
@@ -294,7 +295,6 @@ class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _Count = Annotated[int, msgspec.Meta(ge=-(1 << 31), le=1 << 31)]
-IMU_SILENT = "imu_silent"  # of a calibrated IMU, whose last sample is older than a second, or that sent none
 
 
 class FailureEvidence(msgspec.Struct, frozen=True, array_like=True):
@@ -304,7 +304,7 @@ class FailureEvidence(msgspec.Struct, frozen=True, array_like=True):
     expected landmarks: x and y in cells from the robot's believed one, and its expected and seen landmarks. usual_percent of the expected
     landmarks were seen until then, 0 if unknown. places: where fixes agree: x and y in `map` in centimetres, number of fixes, and percent
     of the landmarks expected there that they found. broke: all tracks were lost between two good images. dropped_percent of the last
-    seconds' frames. flags: `imu_silent`, sensors left out, and overload.
+    seconds' frames. flags: sensors left out or silent, and overload.
     """
 
     view_percent: _Count

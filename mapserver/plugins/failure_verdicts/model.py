@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from math import dist, exp, inf, isfinite, log, log1p
 
-from fleetmap.messages import IMU_SILENT, Cause, FailureEvidence, FailureReport
+from fleetmap.messages import Cause, FailureEvidence, FailureReport, Flag
 
 SAYS = {
     "robot": "the robot is wrong",
@@ -22,6 +22,8 @@ _LEAST_P = 0.8  # below, the verdict is `unknown`
 _NEVER = 0.05  # of the probability, shared by all: simulated failures of a few sites do not show what else happens
 _IMAGE = {Cause.DARK, Cause.GLARE, Cause.FROZEN, Cause.BLURRED, Cause.OCCLUDED, Cause.NO_FRAMES}
 _SENSOR = {Cause.CALIBRATION, Cause.OVERLOADED, Cause.ODOMETRY, Cause.NO_MAP}
+_ABSENT = {Flag.IMU_SILENT, Flag.WHEELS_UNMOUNTED}
+_CONTRADICTED = {Flag.IMU_REFUSED, Flag.ACCELEROMETER_REFUSED, Flag.WHEELS_REFUSED}  # by images: either may be wrong
 _NEAR_M = 2.5  # racks are moved by less, look-alikes lie farther
 _FARTHEST_M = 1e6
 _LEAST_EXPECTED, _EMPTY_SHARE = 5, 0.25  # landmarks of a cell, and the share of the usual ones below which it is empty
@@ -66,11 +68,14 @@ def figures(report: FailureReport, evidence: FailureEvidence) -> list[float]:
     fit = min(max((percent for *_, percent in places), default=0) / 100.0 / usual, 1.0)
     apart = any(dist(one[:2], other[:2]) > 100.0 * _NEAR_M for one, other in combinations(places, 2))
     is_far, is_nowhere = float(wrong_m is not None and not is_near), float(wrong_m is None and not apart and is_seen)
-    unseen, is_faulty = 1.0 - evidence.view_percent / 100.0, cause in _SENSOR or set(evidence.flags) - {IMU_SILENT}
+    # Images by which a robot was localized are right, and it drives on by them; those without landmarks tell of the building
+    is_spared = evidence.usual_percent or (is_seen and seen < _EMPTY_SHARE * usual * expected)
+    spared = _ABSENT | _CONTRADICTED if is_spared else _ABSENT
+    unseen, is_faulty = 1.0 - evidence.view_percent / 100.0, cause in _SENSOR or set(evidence.flags) - spared
     found = [
         float(cause in _IMAGE),
-        # A calibration that fixes contradict blames neither: racks move too. An IMU lacks only where images tell nothing
-        1.0 if is_faulty else unseen * (IMU_SILENT in evidence.flags),
+        # A calibration that fixes contradict blames neither: racks move too. What is spared lacks only where images tell nothing
+        1.0 if is_faulty else unseen * bool(evidence.flags),
         unseen,
         float(evidence.broke),
         float(cause == Cause.CARRIED),

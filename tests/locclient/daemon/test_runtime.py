@@ -23,7 +23,7 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from fleetmap.sensors.samples import CameraFrame
+from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetmap.version_grid import OccupancyGrid
@@ -354,6 +354,24 @@ def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: Worl
     check_tracking(list(enumerate(said))[35:])
     (status,) = world.fleet.robots("room")
     assert status.last_health["flags"] == ("imu_refused" if is_imu else "wheels_refused",)
+
+
+def test_an_imu_that_is_late_and_later_falls_silent_costs_no_pose_and_people_see_it(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In the light. It begins while the robot drives, and counts as odometry that is lost for a moment when it ends."""
+    bundles = list(robot_world.bundles(114))
+    for number in (*range(20), *range(100, 114)):
+        bundles[number] = replace(bundles[number], imu=ImuSamples.empty())
+    robot, listener = robot_world.new_robot(), Listener()
+    source = ScriptedSource(bundles, {}, lambda: robot.running is not None)
+    brief = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=0.06)
+    said = started(world.parts(source, robot, listener)._replace(intake=brief))
+    check_tracking([(n, one) for n, one in enumerate(said) if n not in range(101, 104)])
+    assert [said[n].odometry.inertial for n in (19, 50, 99)] == [False, True, True]
+    assert sum("the IMU is silent" in text for text in caplog.messages) == 2
+    (status,) = world.fleet.robots("room")
+    assert status.last_health["flags"] == ("imu_silent",)
 
 
 def test_a_lying_account_on_the_bus_ends_nothing(world: World) -> None:

@@ -38,10 +38,26 @@ def test_the_evidence_of_each_verdict(expected: str) -> None:
     assert found.places_m == ([(20.0, 6.0), (20.0, 11.0)] if expected == "lookalike" else [])
 
 
-def test_a_silent_imu_tells_nothing_of_a_changed_building() -> None:
-    silent, dark = (msgspec.structs.replace(of, flags=("imu_silent",)) for of in (EMPTY, FailureEvidence(0, 33)))
-    assert verdict(msgspec.structs.replace(REPORT, evidence=silent)).says == "building"
-    assert verdict(msgspec.structs.replace(REPORT, cause=Cause.DARK, evidence=dark)).words.endswith("%): imu silent")
+@pytest.mark.parametrize(
+    "flag", ["imu_silent", "imu_refused", "accelerometer_refused", "wheels_refused", "wheels_unmounted"]
+)
+def test_a_sensor_that_is_left_out_tells_nothing_of_a_changed_building(flag: str) -> None:
+    lacking, dark = (msgspec.structs.replace(of, flags=(flag,)) for of in (EMPTY, FailureEvidence(0, 33)))
+    assert verdict(msgspec.structs.replace(REPORT, evidence=lacking)).says == "building"
+    said = verdict(msgspec.structs.replace(REPORT, cause=Cause.DARK, evidence=dark)).words
+    assert said.endswith(f"%): {flag.replace('_', ' ')}")
+    never = msgspec.structs.replace(REPORT, evidence=msgspec.structs.replace(lacking, usual_percent=0))
+    assert verdict(never).says == "building"
+    in_sight, is_absent = msgspec.structs.replace(never, landmarks_seen=90), flag in ("imu_silent", "wheels_unmounted")
+    faults = [
+        model.figures(in_sight, of)[1] for of in (lacking, never.evidence)
+    ]  # landmarks without a fix: wrong images
+    assert [fault < 0.1 for fault in faults] == [True, is_absent]
+
+
+@pytest.mark.parametrize("flag", ["images_refused", "overloaded"])
+def test_images_that_are_refused_or_dropped_tell_a_wrong_robot(flag: str) -> None:
+    assert verdict(msgspec.structs.replace(REPORT, evidence=msgspec.structs.replace(EMPTY, flags=(flag,)))).robot > 0.9
 
 
 def test_failures_elsewhere_revise_it() -> None:

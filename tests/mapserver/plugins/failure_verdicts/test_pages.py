@@ -18,10 +18,12 @@ from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, serving
 from support.pages.browser import Chromium
 
-CHANGED = FailureEvidence(96, 33, ((3, 2, 40, 0), (4, 2, 38, 1), (5, 2, 22, 0), (3, -2, 20, 9)))
+CELLS = (3, 2, 40, 0), (4, 2, 38, 1), (5, 2, 22, 0), (3, -2, 20, 9)
+CHANGED = FailureEvidence(96, 33, CELLS, flags=("wheels_refused",))
 ALIKE = FailureEvidence(98, 34, (), ((2000, 600, 3, 34), (2000, 1400, 2, 33), (2010, 2200, 2, 30)))
 NAME = "Kühlhaus <冷>"
 GIVEN = {"tug-1": (Cause.NO_MATCH, 9, None, CHANGED), "tug-2": (Cause.ALIASED, 136, 8.0, ALIKE)}
+GIVEN |= {"tug-3": (Cause.DARK, 0, None, FailureEvidence(0, 33, flags=("imu_silent",)))}
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +46,9 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 def test_a_file_has_them(served: Served) -> None:
     file, ask = served.folder / "failures.jsonl", ("fleet", "export", "--format", "verdicts", "--store")
-    assert CliRunner().invoke(app, [*ask, str(served.folder), str(file)]).stdout == "4 failures\n"
+    assert CliRunner().invoke(app, [*ask, str(served.folder), str(file)]).stdout == "5 failures\n"
     said = [json.loads(line)["verdict"]["says"] for line in file.read_text("utf-8").splitlines()]
-    assert said == ["unknown", "unknown", "building", "lookalike"]
+    assert said == ["unknown", "unknown", "building", "lookalike", "robot"]
 
 
 def test_missing_landmarks_are_drawn_look_alikes_marked_and_verdicts_collected(page: Page, served: Served) -> None:
@@ -59,7 +61,11 @@ def test_missing_landmarks_are_drawn_look_alikes_marked_and_verdicts_collected(p
     opened(page, served, "failures/4")
     places = [(mark["x"], mark["y"]) for mark in marks(page) if mark["shape"] == "triangle"]
     assert places == [(20.0, 14.0), (20.1, 22.0)], "where it believed to be is not another place"
+    opened(page, served, "failures/5")
+    expect(page.locator("#verdict")).to_contain_text("the robot is wrong (")
+    expect(page.locator("#verdict")).to_contain_text("%): imu silent")
+    assert httpx.get(f"{served.http}/v1/failures/5/verdict").json()["words"].endswith("%): imu silent")
     asked = httpx.get(f"{served.http}/v1/sites/{SITE}/verdicts").json()
-    assert asked == {"1,0": {"building": 1, "lookalike": 1, "unknown": 2}}
+    assert asked == {"1,0": {"building": 1, "lookalike": 1, "robot": 1, "unknown": 2}}
     opened(page, served, "trends")
-    expect(page.get_by_role("table", name="Verdicts on failures")).to_contain_text(f"{NAME}–112")
+    expect(page.get_by_role("table", name="Verdicts on failures")).to_contain_text(f"{NAME}1112")
