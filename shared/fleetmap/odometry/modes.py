@@ -440,12 +440,13 @@ class StartingMode(GyroMode):
 
     def _dynamic_start(self) -> InitialState | None:
         settings = self._rig.settings.start
-        stamps, places = zip(*self._trajectory[-2 * settings.moving_frames :], strict=True)
+        least_ns = settings.moving_duration_s * 0.9e9  # more frames than `moving_frames` of a camera of 30 Hz
+        most = max(settings.moving_frames - 1, sum(self.stamp_ns - stamp <= least_ns for stamp, _ in self._trajectory))
+        stamps, places = zip(*self._trajectory[-2 * most - 2 :], strict=True)
         seen, imu = Trajectory(np.array(stamps, np.int64), np.array(places)), self._imu.samples.imu
-        vision, felt_ns = felt_part(seen, imu, settings.moving_frames - 1)
-        if len(felt_ns) < 4 or felt_ns.sum() < settings.moving_duration_s * 0.9e9:
-            return None
-        if felt_ns.max() > settings.moving_gap_s * 1e9:
+        vision, felt_ns = felt_part(seen, imu, most)
+        is_short = len(felt_ns) < 4 or felt_ns.sum() < least_ns
+        if is_short or felt_ns.max() > settings.moving_gap_s * 1e9:
             return None
         return dynamic_initialization(vision, imu, self._imu.weighing_noise, self._rig.settings)
 

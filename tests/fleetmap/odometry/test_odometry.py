@@ -129,6 +129,14 @@ def test_a_start_in_motion_is_by_what_the_imu_felt(from_ms: int, lost_ms: int, e
     assert not any(e.status is OdometryStatus.DEGRADED for e in said[started:])
 
 
+def test_a_fast_camera_starts_in_motion_within_a_second() -> None:
+    """Of 30 Hz, of which twenty frames are too short."""
+    felt = noisy_imu(np.random.default_rng(1), 1.5, IMU, np.array([0.01, -0.02, 0.015]), np.zeros(3))
+    frames = (stereo_frame(k * 33_000_000) for k in range(1, 33))
+    started = next(e for e in driven(Odometry(mounted(IMU), OdometrySettings()), frames, felt) if e.inertial)
+    np.testing.assert_allclose(started.gyro_bias_radps, [0.01, -0.02, 0.015], atol=0.005)
+
+
 def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
     odometry, estimates = visual
     assert all(e.status is OdometryStatus.TRACKING and not e.inertial for e in estimates)

@@ -226,8 +226,7 @@ class MonocularMode(Mode):
         if stamp_ns - self._tried_ns < settings.monocular.sample_interval_s * 1e9:
             return None
         self._tried_ns = stamp_ns
-        most = settings.monocular.metric_max_samples - 1
-        vision, _ = felt_part(self._spaced_trajectory(), imu.samples.imu, most)
+        vision, _ = felt_part(self._spaced_trajectory(), imu.samples.imu, settings.monocular.metric_max_samples)
         if len(vision) < settings.monocular.metric_samples:
             return None
         noise, body_from_cam = imu.weighing_noise, self._rig.body_from_cam
