@@ -6,7 +6,8 @@ two hypotheses, their landmarks are superimposed in the odometry frame:
 
 * Landmarks that look the same at the same position of both are excluded. Those of a third hypothesis do not support theirs: if the robot's
   own aisle is not mapped, its aliases would otherwise be distinguished by features that they share with it. If they are absent, they count
-  against theirs: an object of one aisle alone mostly stands where all the others have the same one.
+  against theirs: an object of one aisle alone mostly stands where all the others have the same one. If they are observed, they must not
+  hide the absence of a sign in the same cell. So the comparison is made with and without them, and the stronger support counts.
 * The others are compared cell by cell. In most cells both places contain the same object, mapped by different corners, or the
   object was removed. If the landmarks of one place are observed and those of the other never are, one of the two is wrong.
 * A cell with landmarks of one place only is ignored: the budget may have dropped the other's, or a box may have been moved.
@@ -145,8 +146,9 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
         return 0.0
     one_alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
     mark_shared(one, other, one_alike, other_alike)
-    against = _support(common, (other, other_shared), (one, one_alike))
-    return _support(common, (one, one_shared), (other, other_alike)) - against
+    # The result is no larger than the better of the two comparisons: a wrong place needs one that is wrong by as much.
+    against = max(_support(common, (other, other_shared), (one, flags)) for flags in (one_alike, one_shared))
+    return max(_support(common, (one, one_shared), (other, flags)) for flags in (other_alike, other_shared)) - against
 
 
 def _support(looks: int, one: tuple[ObservationHistory, Flags], other: tuple[ObservationHistory, Flags]) -> float:

@@ -244,3 +244,19 @@ def test_a_history_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(64):
         history.begin_look()
     assert len(history.ids) == history.looks == 0
+
+
+def test_what_twins_share_and_the_robot_sees_does_not_hide_a_sign() -> None:
+    """The map has it of both twins, not of the own aisle, in the places of the signs."""
+    found = []
+    for seed in range(8):
+        hall = Aisles(seed, count=3)
+        sign = np.flatnonzero(hall.things[1] == 2)
+        points, looks = hall.points[1][sign], hall._looks(len(sign))
+        for aisle in (1, 2):
+            hall.points[aisle] = np.concatenate([hall.points[aisle], points])
+            hall.looks[aisle] = np.concatenate([hall.looks[aisle], hall._spoiled(looks)])
+            hall.things[aisle] = np.concatenate([hall.things[aisle], np.zeros(len(sign), int)])
+        one, *others = hall.drive(0)
+        found.append(min(log_odds(one, others[0], others[1]), log_odds(one, others[1], others[0])))
+    assert min(found) > DECIDES
