@@ -116,9 +116,8 @@ class Robot:
         self._wheels = motion_checks.WheelAgreement(calibration.base_from_body)
         self._views = motion_checks.ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
-        self._imu_ns = self._silent_ns = (
-            0  # stamp of the last IMU sample by the clock of images, and the last frame's time since
-        )
+        self._imu_ns = 0  # of the last sample, by the clock of images
+        self._silent_ns = 0  # from it to the last frame
         self._set_back: Mapping[Flag, str] = {}  # sensors whose clock was
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
