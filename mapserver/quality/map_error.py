@@ -140,11 +140,16 @@ def _disagreement(survey: SurveyMap, map_from_cam: Array, rows: _Rows) -> list[t
 def _scales(squared: Array, predicted: Array) -> tuple[float, float]:
     """Return the share of predicted variances that squared errors show, and a variance beyond. Source: Paule and Mandel 1982.
 
-    One beyond must make all looks likelier (the score at none): those that predict decimetres tell nothing of millimetres, and a few of
-    them, at landmarks that another pass hardly placed, are off by more.
+    One beyond must make all looks together likelier, as errors of a Gaussian: a few at landmarks that another pass hardly placed
+    predict decimetres, and are off by more, where many others show millimetres.
     """
-    ratios = squared / predicted
-    share = float(np.mean(ratios))
-    if share <= 1.0 or np.average(ratios, weights=1.0 / predicted) <= 1.0:
-        return min(max(share, _LEAST_SHARE), 1.0), 0.0
-    return 1.0, float(scipy.optimize.brentq(lambda v: np.mean(squared / (predicted + v)) - 1.0, 0.0, squared.max()))
+    share = float(np.mean(squared / predicted))
+    if share <= 1.0:
+        return max(share, _LEAST_SHARE), 0.0
+
+    def surprise(beyond: float) -> float:
+        total = predicted + beyond
+        return float(np.sum(squared / total + np.log(total)))
+
+    beyond = float(scipy.optimize.brentq(lambda v: np.mean(squared / (predicted + v)) - 1.0, 0.0, squared.max()))
+    return 1.0, beyond if surprise(beyond) < surprise(0.0) else 0.0
