@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -439,17 +438,6 @@ def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(trac
         elsewhere = tracking.go(0.4, [off(9.0)])
     assert elsewhere.innovation is not None
     assert elsewhere.innovation_m is None
-
-
-def test_a_failed_look_is_repeated_beside_the_pose_before_a_search_delays_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("support.fleet.scripted_robot.FRAME_NS", FRAME_NS // 4)
-    robot = Robot().load()
-    robot.ride(40, 0.1)
-    anywhere = Mock(side_effect=robot.relocalizer.anywhere)
-    monkeypatch.setattr(robot.relocalizer, "anywhere", anywhere)
-    while not anywhere.called:
-        robot.go(0.1, NO_FIX)
-    assert robot.frames == 56, "two looks after the first one that failed, 0.2 s apart"
 
 
 @pytest.mark.parametrize("broken", ["cov_rot_trans", "map_from_body"])
