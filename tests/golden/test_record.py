@@ -14,7 +14,9 @@ TINY = {
 
 
 def test_it_is_the_same_but_for_times() -> None:
-    first, second = (record.record(TINY, {"tiny": FOUND | {"cpu_ms": ms}}) for ms in (2, 3))
+    first, second = (
+        record.record(TINY, {"tiny": FOUND | {"cpu_ms": ms, "pictures": {"sha256": f"{ms:064x}"}}}) for ms in (2, 3)
+    )
     assert first.pop("measured") != second.pop("measured")
     assert first == second
     assert first["sha256"] != record.record(TINY, {"tiny": FOUND | {"tile": 64 * "b"}})["sha256"]

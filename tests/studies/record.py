@@ -28,8 +28,9 @@ from support.programs import TESTS, run
 
 RECORD = TESTS.parent / "docs" / "record.json"
 MOST_MM = 0.1  # of a pose's origin, and of points 1 m from it by its rotation
-# In names of figures that no run repeats. The bytes of a map are some more or less, since its manifest says how long the build took.
-_MEASURED = re.compile(r"cpu|rss|seconds|_ms(?![a-z])|map_bytes")
+# In names of what no run repeats. The bytes of a map are some more or less, since its manifest says how long the build took, and the index
+# of its pictures says when it kept them.
+_MEASURED = re.compile(r"cpu|rss|seconds|_ms(?![a-z])|map_bytes|pictures/sha256")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 Record = dict[str, Any]
@@ -73,8 +74,10 @@ def record(entries: dict[str, Any], found: dict[str, Any]) -> Record:
         for path, leaf in leaves(values, name):
             if path.endswith(".tum") and entries[name].get("repeated"):
                 made["poses"][path] = leaf
-            elif path.endswith(".tum") or (isinstance(leaf, str) and _SHA256.fullmatch(leaf)):
-                made["hashes"][path] = leaf if len(leaf) == 64 else sha256(leaf)
+            elif path.endswith(".tum"):
+                made["hashes"][path] = sha256(leaf)
+            elif isinstance(leaf, str) and _SHA256.fullmatch(leaf) and not _MEASURED.search(path):
+                made["hashes"][path] = leaf
     return made | {"sha256": sha256([made[part] for part in ("figures", "hashes", "poses")])}
 
 
