@@ -440,7 +440,7 @@ class StartingMode(GyroMode):
 
     def _dynamic_start(self) -> InitialState | None:
         settings = self._rig.settings.start
-        least_ns = settings.moving_duration_s * 0.9e9  # more frames than `moving_frames` of a camera of 30 Hz
+        least_ns = settings.moving_duration_s * 0.9e9  # a camera of 30 Hz needs more than `moving_frames` for it
         most = max(settings.moving_frames - 1, sum(self.stamp_ns - stamp <= least_ns for stamp, _ in self._trajectory))
         stamps, places = zip(*self._trajectory[-2 * most - 2 :], strict=True)
         seen, imu = Trajectory(np.array(stamps, np.int64), np.array(places)), self._imu.samples.imu

@@ -66,7 +66,7 @@ def test_looks_that_hardly_tell_do_not_widen_the_map_by_some_bad_ones_and_a_bent
     assert np.mean(squared / of_looks) > 1.2 and _scales(squared, of_looks) == (1.0, 0.0)
     squared[:8] = 0.01**2
     assert _scales(squared, of_looks)[1] > 0.003**2
-    squared[:40], squared[40:] = 0.6 * of_looks[:40], 0.1**2  # as far off as a third of the map is vague, all of it
+    squared[:40], squared[40:] = 0.6 * of_looks[:40], 0.1**2  # all vague looks are far off
     assert _scales(squared, of_looks)[1] > 0.04**2
 
 
