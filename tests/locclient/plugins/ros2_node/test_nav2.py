@@ -300,6 +300,9 @@ def test_the_tree_holds_the_true_pose_at_every_frame(tmp_path: Path) -> None:
             assert first < life.start + 75, "ROS has connected all before the driver's pose is not known"
             unknown = {*RESTART_FRAMES, RESTART_FRAMES.start - 1} if not is_publisher else set()
             assert set(range(first, life.stop - 5)) - unknown <= set(placed)
-        for number, (stamp_ns, map_from_odom) in placed.items():
+        # ROS may lose a message on its way from the driver to the listener: of up to some frames' poses
+        heard = {number: link for number, link in placed.items() if link[0] in odom_from_base}
+        assert len(heard) >= len(placed) - (0 if is_publisher else 5)
+        for number, (stamp_ns, map_from_odom) in heard.items():
             error_m = (map_from_odom @ odom_from_base[stamp_ns])[:3, 3] - truth[number][:3, 3]
             assert np.linalg.norm(error_m) < 0.025, (name, number)
